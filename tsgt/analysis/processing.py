@@ -32,20 +32,13 @@ Estimator = Literal["linear", "continuous"]
 def process(
     recording: Recording, *, path: Path, on_progress: Callable[[float], None] | None = None
 ) -> PoseBatch:
-    """Compute the poses of a recording with its own parameters and estimator.
+    """Compute the poses of a recording with its own parameters and estimator: all epochs, at least one of them valid.
 
     Measurements are processed in the order of their timestamps. With ``linear`` the poses equal those of the live stream if
     no measurement arrived late; with ``continuous`` each pose depends on the measurements before and after it.
-
-    ``on_progress``: Called with the completed fraction, 0 to 1.
-
-    Returns all epochs, valid or not; at least one is valid.
-
-    Raises
-    ------
-    RecordingError
-        There are no measurements, none of one of the prisms, they span days, or no epoch has a valid pose.
-    DegenerateGeometryError : The prisms coincide or lie in a line.
+    ``on_progress`` gets the completed fraction, 0 to 1. Raises RecordingError without measurements at all or of one of the
+    prisms, if they span days, or if no epoch has a valid pose; DegenerateGeometryError if the prisms coincide or lie in a
+    line.
     """
     if recording.parameters.pipeline.estimator == "continuous":
         return smooth_recording(recording, path=path, on_progress=on_progress).poses
@@ -74,14 +67,7 @@ def with_estimator(recording: Recording, estimator: Estimator) -> Recording:
 
 
 def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: Path) -> Parameters:
-    """Replace the frames of all stations by those of a set-up file.
-
-    ``frames``: ``T_station1_station`` by station number.
-
-    Raises
-    ------
-    ConfigError : A station of the recording has no frame in the file.
-    """
+    """Replace the frames of all stations by ``T_station1_station`` of a set-up file. Raises ConfigError if one is missing."""
     missing = [s.station for s in parameters.stations if s.station not in frames]
     if missing:
         raise ConfigError(
@@ -110,13 +96,9 @@ def with_latencies(parameters: Parameters, latencies_ns: Mapping[int, int]) -> P
 
 
 def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: Path) -> Parameters:
-    """Replace the prism layout by that of a set-up file; prisms that the recording does not have are ignored.
+    """Replace the prism layout by that of a set-up file, in m in the robot frame; prisms that the recording lacks are ignored.
 
-    ``layout``: Positions in the robot frame in m by prism number.
-
-    Raises
-    ------
-    ConfigError : A prism of the recording has no position in the file, or the layout determines no pose.
+    Raises ConfigError if a prism of the recording has no position in the file, or the layout determines no pose.
     """
     missing = [p.prism for p in parameters.prisms if p.prism not in layout]
     if missing:

@@ -1,9 +1,7 @@
-"""Published field data of the paper's authors as measurements.
+"""Published field data of the paper's authors (``RTS_project``) as measurements.
 
-Their ``RTS_project`` repository holds the result of their own processing: per prism a track of Unix time and position in
-the frame of station 1, and the prism positions on the robot. With the targets of the same day the station frames can be
-solved, and each position converted back to the angles and distance that its station measured; without targets the
-positions remain Cartesian.
+Their data is processed: per prism a track of Unix time and position in the frame of station 1. With the targets of the same
+day the station frames are solved and positions converted back to angles and distances; otherwise they remain Cartesian.
 """
 
 from __future__ import annotations
@@ -48,20 +46,11 @@ def stations_from_targets(
     prism_constant_m: float,
     tracked: Mapping[int, int] = DEFAULT_TRACKED_PRISMS,
 ) -> SolvedStations:
-    """Solve the station frames from the targets of the day, weighted by the instrument's noise.
+    """Solve the station frames from the targets of the day, the authors' marker file or ours, weighted by instrument noise.
 
-    Parameters
-    ----------
-    path : The authors' marker file or our own target file.
-    target_constant_m : Added to the slope distances of the targets, in m.
-    prism_constant_m : Prism constant assigned to the stations, in m.
-    tracked : Prism number by station number.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be used, holds no targets of one of the stations, or its targets are inconsistent.
-    DegenerateGeometryError : A station has too few targets in common with station 1, or they lie in a line.
+    ``target_constant_m`` is added to the targets' slope distances, ``prism_constant_m`` assigned to the stations;
+    ``tracked``: prism by station. Raises InputFileError if the file cannot be used, a station has no targets, or they are
+    inconsistent; DegenerateGeometryError if one has too few in common with station 1, or they lie in a line.
     """
     measured = read_target_file(path)
     solved = solve_stations(measured, target_constant_m=target_constant_m)
@@ -101,10 +90,7 @@ def stations_from_targets(
 
 
 def point_measurements(tracks: Sequence[PublishedTrack]) -> list[Measurement]:
-    """Convert tracks to Cartesian measurements in the order of time; ``received_ns`` is set to ``stamp_ns``.
-
-    Track k, counted from 1, is that of station k and prism k.
-    """
+    """Convert tracks k (station k, prism k) to Cartesian measurements in the order of time, received at ``stamp_ns``."""
     measurements: list[Measurement] = [
         PointMeasurement(
             station=station,
@@ -123,13 +109,10 @@ def point_measurements(tracks: Sequence[PublishedTrack]) -> list[Measurement]:
 def polar_measurements(
     tracks: Sequence[PublishedTrack], stations: Sequence[StationParameters]
 ) -> list[Measurement]:
-    """Convert positions back to raw angles and slope distances, in the order of time.
+    """Convert positions of track k back to raw angles and slope distances of station k, in the order of time.
 
-    The inverse of processing with the same ``stations``: station k, with its frame and prism constant, for track k.
-
-    Raises
-    ------
-    GeometryError : A position is closer to its station than the prism constant.
+    The inverse of processing with the same ``stations``: frame and prism constant. Raises GeometryError if a position is
+    closer to its station than the prism constant.
     """
     measurements: list[Measurement] = []
     for station, track in zip(stations, tracks, strict=True):

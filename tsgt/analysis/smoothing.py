@@ -41,10 +41,7 @@ _POSE_DIM = 6
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """Process noise, and the factor on the stated sigmas of the instruments.
-
-    ``tuned``: estimated from the measurements; otherwise they were too few, and the values are those of the recording.
-    """
+    """Process noise, and factor on the stated sigmas: ``tuned`` to the measurements; if too few, those of the recording."""
 
     prior: MotionPrior
     noise_scale: float
@@ -55,7 +52,7 @@ class MotionModel:
 class SmoothedRecording:
     """Trajectory fitted to a recording, and its poses at the epochs from the first to the last usable measurement.
 
-    ``sources`` has the measurement of each observation of the fit, ``origin_ns`` the Unix time at which its time is zero.
+    ``sources``: measurement of each observation of the fit. ``origin_ns``: Unix time at which its time is zero.
     """
 
     poses: PoseBatch
@@ -71,16 +68,8 @@ def smooth_recording(
     """Fit a smooth trajectory to all measurements of a recording.
 
     The hyperparameters are estimated from the measurements. Those of the recording, which the live estimator used, bound the
-    process noise: at least a third of them, and all of them while prisms are occluded.
-
-    ``on_progress``: Called with the completed fraction, 0 to 1.
-
-    Raises
-    ------
-    RecordingError
-        There are no measurements, none of one of the prisms, they span days, no trajectory fits them, or no epoch has
-        a valid pose.
-    DegenerateGeometryError : The prisms coincide or lie in a line.
+    process noise: at least a third of them, and all of them while prisms are occluded. Progress is a fraction, 0 to 1.
+    Raises as :func:`tsgt.analysis.processing.process`, also RecordingError if no trajectory fits.
     """
     parameters = recording.parameters
     names = [prism.prism for prism in parameters.prisms]

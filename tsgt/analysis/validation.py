@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import Recording
 
-MAX_EPOCHS = 2_000_000
-"""Upper limit of poses per recording: 28 h at 20 Hz, about 1.5 GB. More indicate a wrong clock."""
+MAX_EPOCHS = 2_000_000  # 28 h at 20 Hz, about 1.5 GB. More indicate a wrong clock
 
 
 def plausible_measurements(recording: Recording) -> list[Measurement]:

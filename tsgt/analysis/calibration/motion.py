@@ -31,13 +31,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutComparison:
-    """Held-out prediction errors of three methods.
+    """Held-out errors: straight lines per prism, and a trajectory with the set-up before and after calibration.
 
-    Attributes
-    ----------
-    linear : Straight lines between each prism's own measurements.
-    before : Trajectory with the recording's set-up; None if its frames are unknown.
-    after : Trajectory with a set-up calibrated without the held-out measurements.
+    ``before`` is None if the recording's frames are unknown; ``after`` is calibrated without the held-out measurements.
     """
 
     linear: HeldOutErrors
@@ -62,18 +58,10 @@ def calibrate_recording(
     held_out: bool = True,
     on_progress: Callable[[str], None] | None = None,
 ) -> CalibratedRecording:
-    """Calibrate from all measurements, and five more times without a fifth of them for cross-validation.
+    """Calibrate from all measurements, and for cross-validation (``held_out``) five more times without a fifth of them.
 
-    Parameters
-    ----------
-    known : Which parameters to estimate, and their priors.
-    frames_known : Start from the recording's frames; otherwise initialise them from motion (frame 1 remains).
-    held_out : Cross-validate.
-    on_progress : Called with a short description of each step.
-
-    Raises
-    ------
-    GeometryError : The recording has no measurements, or its motion does not determine the set-up.
+    ``known`` has the parameters to estimate and their priors. Without ``frames_known`` the frames are initialised from
+    motion (frame 1 remains). Raises GeometryError without measurements, or if the motion does not determine the set-up.
     """
     if not recording.measurements:
         raise GeometryError("the recording has no measurements")

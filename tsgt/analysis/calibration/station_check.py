@@ -41,8 +41,7 @@ class StationCheck:
         a movement across the line of sight cannot be separated.
     moved_sigma_m : One sigma of ``moved_m`` along the movement, from the instrument's noise.
     turned_rad : Rotation angle of the station; None with one target.
-    levelled
-        ``turned_rad`` is the heading only: the targets do not determine tilt, the station is assumed to be levelled.
+    levelled : ``turned_rad`` is the heading only: the targets do not determine tilt, the station is assumed to be levelled.
     ok : The shifts are within noise, or none exceeds the limit.
     consistent
         One rigid movement of the station explains all shifts. False: a target has moved or was confused with another.
@@ -58,14 +57,9 @@ class StationCheck:
 
 
 def check_station(reference: PointSet, current: PointSet, *, limit_m: float = 0.0) -> StationCheck:
-    """Compare a station's current measurements of targets with the reference.
+    """Compare a station's current measurements of targets (a subset, at least one) with the reference, both in its frame.
 
-    Parameters
-    ----------
-    reference, current : Targets in the station's frame; the current ones are a subset of the reference, at least one.
-    limit_m : Shifts up to this are accepted even if they exceed noise.
-
-    The chi-square test of the shifts has a false-alarm probability of 1e-4.
+    Shifts up to ``limit_m`` are accepted even beyond noise. The chi-square test has a false-alarm probability of 1e-4.
     """
     pairs = PointPairs(current, reference.select(current.names), levelled=False)
     unmoved = FrameFit(np.eye(3), np.zeros(3), np.zeros((6, 6)))

@@ -1,7 +1,6 @@
-"""Progress of a target collection, station by station: the state behind ``tsgt calibrate collect``. Sans-I/O but ``resume``.
+"""Progress of a target collection: the state behind ``tsgt calibrate collect``. Sans-I/O but ``resume``.
 
-The target file is the whole state. It is rewritten after every measurement, so that an interruption loses nothing, and
-read again on resumption.
+The target file is the whole state: rewritten after every measurement, read again on resumption.
 """
 
 from __future__ import annotations
@@ -21,19 +20,11 @@ if TYPE_CHECKING:
 
 HEADER = "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm"
 
-StationTarget = tuple[int, int]
-"""Numbers of a station and a target."""
+StationTarget = tuple[int, int]  # Numbers of a station and a target
 
 
 class TargetCollection:
-    """Which station has measured which target.
-
-    Parameters
-    ----------
-    path : The target file.
-    stations, targets : Numbers, in the order in which they are to be measured.
-    repeats : Measurements per target: 2 for both faces.
-    """
+    """Which station has measured which target, in the order of ``stations`` and ``targets``; ``repeats``: 2 for both faces."""
 
     def __init__(
         self, path: Path, stations: Sequence[int], targets: Sequence[int], *, repeats: int = 1
@@ -46,11 +37,9 @@ class TargetCollection:
         self._comments: list[str] = []
 
     def resume(self) -> None:
-        """Read the file if it exists and was written by ``tsgt calibrate collect``; its comments are kept at the top.
+        """Read the file, with its comments at the top, if it exists and was written by ``tsgt calibrate collect``.
 
-        Raises
-        ------
-        InputFileError : It is a file of another kind, has an invalid line, or cannot be read.
+        Raises InputFileError if it is of another kind, has an invalid line, or cannot be read.
         """
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()

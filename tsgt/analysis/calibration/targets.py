@@ -19,31 +19,18 @@ if TYPE_CHECKING:
     from tsgt.analysis.formats import PrismFile, TargetFile, TargetMeasurement
     from tsgt.geometry.calibration import FrameCalibration, PointName, PrismCalibration
 
-REPEAT_LIMIT_M = 0.02
-"""Repeated measurements of a target further than this from their mean are a mistake: another target, a typing error. An
-uncorrected index error of 30" in two faces stays within it up to 130 m.
-"""
-
-CAD_SIGMA_M = 0.001
-"""One sigma per axis of a body point on the real robot relative to CAD: machining, and the adhesive target."""
+REPEAT_LIMIT_M = 0.02  # From the mean; beyond is a mistake. An index error of 30" is within up to 130 m
+CAD_SIGMA_M = 0.001  # Per axis of a body point relative to CAD: machining, and the adhesive target
 
 
 def solve_stations(
     file: TargetFile, *, target_constant_m: float, weighted: bool = True, levelled: bool = False
 ) -> dict[int, FrameCalibration]:
-    """Solve the frame of each station from the targets that it has in common with station 1.
+    """Solve ``T_station1_station`` of each station but 1 from the targets that it has in common with station 1.
 
-    Parameters
-    ----------
-    target_constant_m : Added to each slope distance whose line has no constant of its own, in m.
-    weighted, levelled : As for :func:`tsgt.geometry.calibration.targets.calibrate_frame`.
-
-    The frames, without station 1, are by station number; ``T`` is ``T_station1_station``.
-
-    Raises
-    ------
-    DegenerateGeometryError : A station has fewer than three targets in common with station 1, or they lie in a line.
-    InputFileError : Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
+    ``target_constant_m`` is added to slope distances without a constant of their own; ``weighted``, ``levelled``: see
+    :func:`tsgt.geometry.calibration.targets.calibrate_frame`. Raises DegenerateGeometryError if fewer than three targets are
+    in common or they lie in a line, InputFileError as :func:`mean_points`.
     """
     points = {
         station: mean_points(file.path, targets, target_constant_m, f"target {{}} of station {station}")
@@ -84,20 +71,11 @@ def target_residuals(frame: FrameCalibration) -> tuple[TargetResidual, ...]:
 
 
 def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m: float) -> PrismCalibration:
-    """Solve the prisms' positions in the robot frame.
+    """Solve the prisms' positions in the robot frame, named by their numbers.
 
-    Parameters
-    ----------
-    target_constant_m, prism_constant_m
-        Added to the slope distances of body points and of prisms whose line has no constant of its own, in m.
-
-    The names of the solved prisms are their numbers.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        There are fewer than three body points or they lie in a line; or three or more prisms do.
-    InputFileError : Repeated measurements of one point are inconsistent, or a constant exceeds a distance.
+    The constants are added to slope distances, of body points and of prisms, without one of their own. Raises
+    DegenerateGeometryError if there are fewer than three body points or they lie in a line, or three or more prisms do;
+    InputFileError as :func:`mean_points`.
     """
     body = mean_points(file.path, file.body, target_constant_m, "body point {}")
     prisms = mean_points(file.path, file.prisms, prism_constant_m, "prism {}")
@@ -123,14 +101,8 @@ def mean_points(
 ) -> PointSet:
     """Return the mean position of each target in the frame of the station, with its covariance.
 
-    Parameters
-    ----------
-    constant_m : Added to the slope distances that have no constant of their own, in m.
-    what : Name of a target in messages, with ``{}`` for its number.
-
-    Raises
-    ------
-    InputFileError : Repeated measurements of one target are inconsistent, or a constant exceeds a distance.
+    ``constant_m`` is added to slope distances without one of their own; ``what`` names a target in messages, ``{}`` for its
+    number. Raises InputFileError if repeated measurements are inconsistent, or a constant exceeds a distance.
     """
     names: list[PointName] = []
     points, covariances = [], []

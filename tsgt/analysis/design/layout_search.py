@@ -25,13 +25,10 @@ Criterion = Literal["rotation", "position"]
 
 _GRID = 5
 _STARTS = 8
-_SWEEPS = 20
-"""Upper limit of sweeps; more would only repeat rounding errors."""
+_SWEEPS = 20  # Upper limit of sweeps; more would only repeat rounding errors
 _FINEST_M = 0.002
-_OTHER_WEIGHT = 0.01
-"""Weight of the criterion that was not chosen, 1 rad equal to 1 m: breaks ties between a layout and its mirror image."""
-_GAIN = 1e-9
-"""Minimal relative improvement of a move."""
+_OTHER_WEIGHT = 0.01  # Of the other criterion, 1 rad equal to 1 m: breaks ties with the mirror image
+_GAIN = 1e-9  # Minimal relative improvement of a move
 
 # Diffuse prior: negligible against measurements, but keeps the variance finite for prisms in a line.
 _PRIOR_INFORMATION = 1e-6
@@ -75,18 +72,10 @@ class LayoutProblem:
 def optimal_layout(
     problem: LayoutProblem, random: np.random.Generator, *, on_progress: Callable[[float], None] | None = None
 ) -> FloatArray:
-    """Find the prism positions in the envelope that minimise the variance of the pose.
+    """Find the prism positions, (count, 3) in the robot frame in m, that minimise the variance of the pose.
 
-    Parameters
-    ----------
-    random : Source of the random starts.
-    on_progress : Called with the completed fraction, 0 to 1.
-
-    Returns prism positions in the robot frame in m, (count, 3).
-
-    Raises
-    ------
-    GeometryError : The envelope is too small for the minimal separation.
+    ``on_progress`` gets the completed fraction, 0 to 1. Raises GeometryError if the envelope is too small for the
+    separation.
     """
     axes = [np.unique(np.linspace(low, high, _GRID)) for low, high in zip(*problem.envelope_m, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -141,10 +130,7 @@ def _exchange(
     problem: LayoutProblem,
     candidates: Callable[[int, FloatArray], tuple[FloatArray, FloatArray]],
 ) -> tuple[float, FloatArray]:
-    """Move each prism in turn to its best candidate until none improves.
-
-    ``candidates`` returns, for a prism and its present place, places (M, 3) and their information (M, N, 6, 6).
-    """
+    """Move each prism in turn to its best candidate, from places (M, 3) and information (M, N, 6, 6), until none improves."""
     layout = layout.copy()
     information = [problem.information(layout[i][None], i)[0] for i in range(problem.count)]
     variance = float(problem.variance(sum(information, start=np.zeros_like(information[0]))))

@@ -22,19 +22,13 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.model import InstrumentNoise
 
-MAX_POINT_DISTANCE_M = 10_000.0
-"""Upper limit of the distance between the evaluated point and the prisms."""
-
-HEADING_COUNT = 8
-"""Number of headings of the robot at each place, evenly around the circle."""
+MAX_POINT_DISTANCE_M = 10_000.0  # Upper limit of the distance between the evaluated point and the prisms
+HEADING_COUNT = 8  # Number of headings of the robot at each place, evenly around the circle
 
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A station at ``position_m`` in the world, (3,), with the noise of a single measurement.
-
-    ``prism_index`` is the index in the layout of the prism that it tracks.
-    """
+    """A station at ``position_m`` in the world, (3,), with single-measurement noise and its prism's index in the layout."""
 
     position_m: FloatArray
     noise: InstrumentNoise
@@ -102,19 +96,10 @@ class PoseAccuracy:
 def pose_covariances(
     layout: FloatArray, stations: tuple[Station, ...], robot_poses: RobotPoses, point_m: FloatArray
 ) -> FloatArray:
-    """Return the covariance of the pose from one measurement by each station, weighted by their noise.
+    """Return (N, 6, 6) of the pose from one measurement by each station: position of the point (m), rotation vector (rad).
 
-    Parameters
-    ----------
-    layout : P >= 3 prisms in the robot frame in m, (P, 3).
-    stations : At least one per prism.
-    point_m : Point of the robot whose position is evaluated, in the robot frame, (3,).
-
-    Returns (N, 6, 6), in the axes of the robot: position of the point in m, rotation vector in rad.
-
-    Raises
-    ------
-    GeometryError : The layout determines no pose, a prism has no station, or the point is far from the robot.
+    Axes of the robot. ``layout``: P >= 3 prisms, (P, 3), and ``point_m``: the evaluated point, (3,), in the robot frame in
+    m. Raises GeometryError if the layout determines no pose, a prism has no station, or the point is far from the robot.
     """
     check_layout(layout)
     untracked = set(range(len(layout))) - {station.prism_index for station in stations}
@@ -144,14 +129,9 @@ def prism_information(
     robot_poses: RobotPoses,
     point_m: FloatArray,
 ) -> FloatArray:
-    """Return the Fisher information about the pose in the measurements of one prism, for M candidate places of it.
+    """Return the Fisher information (M, N, 6, 6) about the pose in one prism's measurements, at M candidate places of it.
 
-    Parameters
-    ----------
-    places_m : In the robot frame, (M, 3).
-    prism_index, stations, robot_poses, point_m : As for :class:`Station` and :func:`pose_covariances`.
-
-    Returns (M, N, 6, 6), in the order and axes of :func:`pose_covariances`.
+    ``places_m``: (M, 3) in the robot frame. All else is as for :func:`pose_covariances`.
     """
     in_world = rotate(robot_poses.rotation, places_m[:, None]) + robot_poses.position_m
     weight = np.zeros((*in_world.shape, 3))
@@ -173,11 +153,9 @@ def prism_information(
 def station_arrangements(
     stations: tuple[Station, ...], centre_m: FloatArray, distance_m: float
 ) -> dict[str, tuple[Station, ...]]:
-    """Move stations to a horizontal distance from the robot at ``centre_m``: all to one side of it, or evenly around it.
+    """Move stations to a horizontal distance from the robot: all to one side (``together``), or evenly around it (``around``).
 
     The direction of the first station and the heights of all are kept.
-
-    Returns the stations ``together`` and ``around``.
     """
     offset = stations[0].position_m - centre_m
     bearing = math.atan2(offset[1], offset[0])

@@ -60,20 +60,10 @@ def perturbation_study(
     random: np.random.Generator,
     on_progress: Callable[[float], None] | None = None,
 ) -> list[Perturbation]:
-    """Fit the pose to prisms with noise of several sizes.
+    """Fit the pose to prisms with noise of several sigmas; ``samples`` poses for each, of independent noise.
 
-    Parameters
-    ----------
-    layout : P >= 3 prisms in the robot frame in m, (P, 3).
-    noises_m : Sigmas of the noise, one or more.
-    samples : Number of poses per sigma.
-    point_m : Point of the robot whose position is evaluated, in the robot frame, (3,).
-    random : Source of the noise; independent for each sigma.
-    on_progress : Called with the completed fraction, 0 to 1.
-
-    Raises
-    ------
-    GeometryError : The layout determines no pose.
+    ``layout``: P >= 3 prisms, (P, 3), and ``point_m``: the evaluated point, (3,), in the robot frame in m; ``on_progress``
+    gets the completed fraction, 0 to 1. Raises GeometryError if the layout determines no pose.
     """
     check_layout(layout)
     found = []
@@ -122,19 +112,10 @@ def equivalent_noise(
     point_m: FloatArray,
     random: np.random.Generator,
 ) -> Perturbation:
-    """Find the noise that causes a mean inter-prism error, and the pose errors that it causes.
+    """Find the noise that causes a mean inter-prism error above zero, which unlike noise can be measured, and its pose errors.
 
-    The inter-prism error can be measured in the field, the noise on the prisms cannot.
-
-    Parameters
-    ----------
-    layout, samples, point_m, random : As for :func:`perturbation_study`.
-    inter_prism_m : Mean of |measured - true distance|, above zero.
-
-    Raises
-    ------
-    GeometryError
-        The layout determines no pose, or the error is as large as the layout, so that no noise explains it.
+    Arguments as for :func:`perturbation_study`. Raises GeometryError if the layout determines no pose, or the error is as
+    large as the layout, so that no noise explains it.
     """
     check_layout(layout)
     unit_noise = random.standard_normal((samples, *layout.shape))
@@ -151,13 +132,7 @@ def equivalent_noise(
 def first_order_sigmas(
     layout: FloatArray, noise_m: float, *, point_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Propagate noise to first order; valid for small noise.
-
-    Returns
-    -------
-    position_m : FloatArray : One sigma along x, y, z, (3,).
-    rotation_rad : FloatArray : One sigma about x, y, z, (3,).
-    """
+    """Propagate small noise to first order: one sigma of position (m) along and rotation (rad) about x, y, z, (3,) each."""
     covariances = np.broadcast_to(noise_m**2 * np.eye(3), (1, *layout.shape, 3))
     # The propagation yields the covariance of the origin, which is moved to the point.
     (covariance,) = pose_covariance(layout - point_m, np.eye(3)[None], covariances)

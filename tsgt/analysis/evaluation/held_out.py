@@ -28,11 +28,8 @@ if TYPE_CHECKING:
 
 FOLDS = 5
 
-EDGE = 5
-"""This many first and last measurements of a prism are never held out: predicting them would be extrapolation."""
-
-GAP_S = 1.0
-"""A held-out measurement whose neighbours are further apart counts as one at a gap."""
+EDGE = 5  # First and last measurements of a prism that are never held out (extrapolation)
+GAP_S = 1.0  # A held-out measurement whose neighbours are further apart counts as one at a gap
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +74,7 @@ class PredictionErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutErrors:
-    """Distance between measured and predicted position of N held-out measurements, in the order of the folds.
-
-    ``at_gap``, (N,), is as in :class:`Fold`.
-    """
+    """Distance between measured and predicted position of N held-out measurements, by fold; ``at_gap`` as in :class:`Fold`."""
 
     error_m: FloatArray
     at_gap: NDArray[np.bool_]
@@ -97,10 +91,7 @@ class HeldOutErrors:
 
 
 def folds(observations: Observations) -> list[Fold]:
-    """Split observations, which must be in the order of time, into at most five folds per prism, sorted by number.
-
-    Prisms with too few measurements have no fold.
-    """
+    """Split observations, in the order of time, into up to five folds per prism, by number; none with too few measurements."""
     splits = []
     for number in range(FOLDS):
         for prism in range(len(observations.layout)):
@@ -119,10 +110,7 @@ def folds(observations: Observations) -> list[Fold]:
 
 
 def training_rows(observations: Observations, number: int) -> NDArray[np.intp]:
-    """Return the rows that no fold of this number holds out, of any prism.
-
-    Hyperparameters and frames estimated from these rows may serve all folds of this number.
-    """
+    """Return the rows that no fold of this number holds out, of any prism: hyperparameters from these may serve all of them."""
     training = np.ones(len(observations), np.bool_)
     for fold in folds(observations):
         if fold.number == number:
@@ -131,10 +119,7 @@ def training_rows(observations: Observations, number: int) -> NDArray[np.intp]:
 
 
 def cross_validate(splits: Sequence[Fold], error_m: Callable[[Fold], FloatArray]) -> HeldOutErrors:
-    """Collect prediction errors over folds.
-
-    ``error_m``: Predicts the test measurements of a fold from its training measurements; returns the error of each in m.
-    """
+    """Collect prediction errors over folds; ``error_m`` predicts test from training measurements, with errors in m."""
     if not splits:
         return HeldOutErrors(np.empty(0), np.empty(0, np.bool_))
     return HeldOutErrors(
@@ -168,20 +153,12 @@ def held_out_errors(
     *,
     on_progress: Callable[[float], None] | None = None,
 ) -> dict[Estimator, HeldOutErrors]:
-    """Cross-validate both estimators.
+    """Cross-validate both estimators on observations in the order of time, with the stated noise.
 
     The hyperparameters are estimated five times, each time without the test measurements of one number's folds of all
-    prisms, so that no prediction depends on the measurement that it is compared with.
-
-    Parameters
-    ----------
-    observations : In the order of time, with the stated noise.
-    pipeline : Hyperparameters if the measurements are too few to estimate them, and their lower bounds.
-    on_progress : Called with the completed fraction, 0 to 1.
-
-    Raises
-    ------
-    GeometryError : No trajectory fits the training measurements.
+    prisms, so that no prediction depends on the measurement that it is compared with; ``pipeline`` bounds them from below,
+    and replaces them if the measurements are too few. ``on_progress`` gets the completed fraction, 0 to 1. Raises
+    GeometryError if no trajectory fits the training measurements.
     """
     report = on_progress or (lambda _: None)
     splits = folds(observations)

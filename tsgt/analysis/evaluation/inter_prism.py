@@ -148,16 +148,11 @@ def inter_prism(
     stationary_ns: Sequence[tuple[int, int]] | None = None,
     found: EpochDistances | None = None,
 ) -> InterPrismDistances:
-    """Measure the distances between all prisms, moving and stationary.
+    """Measure the distances between all prisms, moving and stationary; no epochs if the tracks do not overlap in time.
 
-    Parameters
-    ----------
-    parameters : The prism layout (the reference distances) and the outage limit.
-    tracks : One track per prism of the layout, in frame ``station1``, none of them empty.
-    stationary_ns : Stationary intervals from another source, such as odometry; clipped to the time of the tracks.
-    found : Result of :func:`distances_at_epochs`, if already computed.
-
-    There are no epochs if the tracks do not overlap in time.
+    ``tracks``: one per prism of the layout, in frame ``station1``, none empty. ``stationary_ns``: intervals from another
+    source, such as odometry; clipped to the time of the tracks. ``found``: from :func:`distances_at_epochs`, if already
+    computed.
     """
     chosen = [tracks[prism.prism] for prism in parameters.prisms]
     found = distances_at_epochs(parameters, tracks) if found is None else found
@@ -182,20 +177,10 @@ def inter_prism(
 
 
 def stationary_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[tuple[int, int]]:
-    """Find the intervals of 3 s or more in which no prism moves.
+    """Return start and end (Unix ns) of the intervals of 3 s or more in which no prism moves, in the order of time.
 
     A track moves between a position and the first one at least 0.3 s later if the speed exceeds 0.05 m/s; across an outage
-    its motion is unknown and counts as moving.
-
-    Parameters
-    ----------
-    tracks : None of them empty.
-    outage_limit_ns : Positions further apart in time are an outage.
-
-    Returns
-    -------
-    list of (int, int)
-        Start and end of each interval in Unix ns, in the order of time.
+    (positions further apart in time than the limit) its motion is unknown and counts as moving. No track may be empty.
     """
     moving: list[tuple[int, int]] = []
     for track in tracks:

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
 
-EDGE_MARGIN_NS = 2_000_000_000
-"""Excluded at the start and end of a trajectory, where the estimator has measurements on one side only."""
+EDGE_MARGIN_NS = 2_000_000_000  # Excluded at both ends: the estimator has measurements on one side only
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,20 +36,15 @@ class PoseErrors:
         return math.degrees(_rms(self.rotation_rad))
 
 
-NEES_95 = 12.591587
-"""95th percentile of the chi-square distribution with 6 degrees of freedom."""
+NEES_95 = 12.591587  # 95th percentile of the chi-square distribution with 6 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
 class NeesStatistics:
     """Normalised estimation error squared (NEES) of position and rotation; NaN without poses.
 
-    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4.2.
-
-    Attributes
-    ----------
-    mean : 6 for consistent covariances; larger if they are overconfident.
-    above_95 : Share above :data:`NEES_95`; 0.05 for consistent covariances.
+    Consistent covariances have mean 6 (overconfident: larger) and a share of 0.05 above :data:`NEES_95`. Source: Bar-Shalom,
+    Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4.2.
     """
 
     mean: float
@@ -83,13 +77,7 @@ class PoseErrorStatistics:
         true: NDArray[np.float64],
         point_m: NDArray[np.float64],
     ) -> PoseErrorStatistics:
-        """Compare poses with the truth at the same instants.
-
-        Parameters
-        ----------
-        estimated, true, point_m : As for :func:`pose_errors`.
-        covariance : (N, 6, 6) of ``estimated``, rotations about the axes of the world.
-        """
+        """Compare as :func:`pose_errors` does; ``covariance``: (N, 6, 6) of ``estimated``, rotations about the world's axes."""
         errors = pose_errors(estimated, true, point_m)
         rotation = log_so3(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
         return cls(
@@ -105,13 +93,9 @@ class PoseErrorStatistics:
 def pose_errors(
     estimated: NDArray[np.float64], true: NDArray[np.float64], point_m: NDArray[np.float64]
 ) -> PoseErrors:
-    """Compare poses with the truth at the same instants, without alignment.
+    """Compare poses ``T_station1_robot``, (N, 4, 4), with the truth at the same instants, without alignment.
 
-    Parameters
-    ----------
-    estimated, true : ``T_station1_robot``, (N, 4, 4) each.
-    point_m
-        Point of the robot whose position is compared, in the frame ``robot``, (3,): usually the centroid of the prisms.
+    ``point_m``: point of the robot whose position is compared, in its frame, (3,): usually the centroid of the prisms.
     """
     offset = transform_points(estimated, point_m) - transform_points(true, point_m)
     rotation = (invert(true) @ estimated)[:, :3, :3]
@@ -155,18 +139,10 @@ class AlignedErrorStatistics:
 def aligned_statistics(
     estimated: FloatArray, true: FloatArray, point_m: FloatArray, mode: Align
 ) -> AlignedErrorStatistics:
-    """Align poses with the truth at the same instants and compare.
+    """Align poses ``T_station1_robot``, (N, 4, 4), with the truth at the same instants; compare a point, (3,) in ``robot``.
 
-    Parameters
-    ----------
-    estimated, true : ``T_station1_robot``, (N, 4, 4) each.
-    point_m : Point of the robot whose positions are aligned and compared, in the frame ``robot``, (3,).
-    mode
-        ``translation``: shift only. ``rigid``: shift and rotation without scale (Umeyama 1991), as evo's ``-a`` does.
-
-    Raises
-    ------
-    DegenerateGeometryError : ``rigid``, and the positions lie in a line or coincide, or there are fewer than three.
+    ``translation``: shift only. ``rigid``: shift and rotation without scale (Umeyama 1991), as evo's ``-a``; it raises
+    DegenerateGeometryError if the positions lie in a line or coincide, or there are fewer than three.
     """
     before = pose_errors(estimated, true, point_m)
     points, true_points = transform_points(estimated, point_m), transform_points(true, point_m)

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
-MAX_INTERPOLATION_GAP_NS = 100_000_000
-"""Reference poses further apart are not interpolated: at 0.5 m/s^2 a straight line over this time is off by 0.6 mm."""
+MAX_INTERPOLATION_GAP_NS = 100_000_000  # At 0.5 m/s^2 a straight line is off by 0.6 mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +58,7 @@ class Reference:
 def read_tum(path: Path) -> Reference:
     """Read a trajectory: ``stamp_s x y z qx qy qz qw`` in each line; ``#`` starts a comment.
 
-    Raises
-    ------
-    InputFileError : It cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
+    Raises InputFileError if it cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -109,13 +106,7 @@ def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
 
 
 def match_poses(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp], FloatArray]:
-    """Find the valid poses in the interior of the reference that have a reference pose.
-
-    Returns
-    -------
-    rows : (N,) of the poses.
-    true : (N, 4, 4) ``T_station1_robot`` of the reference at their instants.
-    """
+    """Return the rows (N,) of valid poses inside the reference, and the reference ``T_station1_robot``, (N, 4, 4), at each."""
     ends_ns = int(reference.stamp_ns[0]), int(reference.stamp_ns[-1])
     rows = np.flatnonzero(poses.valid & interior_mask(poses.stamp_ns, *ends_ns))
     true, known = reference.at(poses.stamp_ns[rows])
@@ -123,12 +114,9 @@ def match_poses(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp
 
 
 def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> PoseErrorStatistics:
-    """Compare the valid poses with a reference, unaligned, from 2 s after its start to 2 s before its end.
+    """Compare valid poses with a reference in frame ``station1``, unaligned, from 2 s after its start to 2 s before its end.
 
-    Parameters
-    ----------
-    reference : Poses of the same robot frame in frame ``station1``.
-    point_m : Point of the robot whose position is compared, (3,): the centroid of the prisms.
+    ``point_m``: point of the robot whose position is compared, (3,): the centroid of the prisms.
     """
     rows, true = match_poses(poses, reference)
     return PoseErrorStatistics.of(_transforms(poses, rows), poses.covariance[rows], true, point_m)
@@ -146,8 +134,7 @@ def _transforms(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:
     return transform_from(rotation_from_quaternion(poses.orientation_xyzw[rows]), poses.position_m[rows])
 
 
-MIN_POSES = 20
-"""One second at 20 Hz: intervals with fewer poses are ignored."""
+MIN_POSES = 20  # One second at 20 Hz: intervals with fewer poses are ignored
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,14 +174,8 @@ def stationary_errors(
 ) -> StationaryErrors:
     """Compare the mean pose of each stationary interval with the mean of the reference at the same instants, unaligned.
 
-    Parameters
-    ----------
-    poses : Invalid ones are ignored.
-    reference : Poses of the same robot frame in frame ``station1``.
-    stationary_ns : Start and end of the intervals, in Unix ns.
-    point_m : Point of the robot whose position is compared, (3,).
-
-    Returns one entry per interval with at least :data:`MIN_POSES` poses that have a reference.
+    Invalid poses are ignored; ``stationary_ns``: start and end in Unix ns; ``point_m``: compared point of the robot, (3,).
+    One entry per interval with at least :data:`MIN_POSES` poses that have a reference.
     """
     position_m, rotation_rad = [], []
     for start_ns, end_ns in stationary_ns:

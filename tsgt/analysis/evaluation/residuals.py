@@ -1,7 +1,4 @@
-"""Residuals of a fitted trajectory by station and axis, and outliers. Sans-I/O.
-
-docs/reference/evaluate.md defines the figures.
-"""
+"""Residuals of a fitted trajectory by station and axis, and outliers: see docs/reference/evaluate.md. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -23,20 +20,15 @@ if TYPE_CHECKING:
 POLAR_AXES = ("range", "horizontal_angle", "zenith_angle")
 POINT_AXES = ("x", "y", "z")
 
-MIN_VARIANCE_SHARE = 1e-3
-"""Residuals whose expected variance is a smaller share of the noise variance carry no information: the trajectory follows
-these measurements exactly.
-"""
+MIN_VARIANCE_SHARE = 1e-3  # Of the noise; below, the trajectory follows the measurement exactly
 
 
 @dataclass(frozen=True, slots=True)
 class ResidualStatistics:
     """Normalised residuals of one axis of a station's measurements, in sigmas; NaN without any.
 
-    Attributes
-    ----------
-    mean, std : 0 and 1 if motion prior and noise are as assumed.
-    beyond_3_sigma : Share with an absolute value above 3; 0.0027 for a normal distribution.
+    If motion prior and noise are as assumed, mean and std are 0 and 1, the share beyond 3 sigmas 0.0027 (normal
+    distribution).
     """
 
     mean: float
@@ -59,13 +51,9 @@ class ResidualStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Outlier:
-    """A rejected measurement: a reflection, another prism, a wrong status.
+    """A rejected measurement, such as a reflection or another prism: recorded time on the master's Unix clock, and error.
 
-    Attributes
-    ----------
-    stamp_ns : As recorded, on the master's Unix clock.
-    missed_mm : Distance between measured and fitted position.
-    sigmas : The same in sigmas of the measurement noise.
+    ``missed_mm``: distance between measured and fitted position. ``sigmas``: the same in sigmas of the measurement noise.
     """
 
     station: int
@@ -76,13 +64,10 @@ class Outlier:
 
 
 def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
-    """Divide residuals by their expected sigma; NaN where a residual carries no information.
+    """Divide residuals by their expected sigma, (M, 3): along the line of sight, horizontally and vertically across it.
 
-    The expected variance of a residual is the noise variance minus the variance of the trajectory at that point, because the
-    trajectory follows the measurement: Q_vv = Q_ll - A Q_xx A^T (Baarda 1968, A testing procedure for use in geodetic
-    networks).
-
-    Returns (M, 3): along the line of sight, horizontally and vertically across it.
+    NaN where a residual carries no information. The trajectory follows the measurement, so its variance there is subtracted:
+    Q_vv = Q_ll - A Q_xx A^T (Baarda 1968, A testing procedure for use in geodetic networks).
     """
     at = nearest_knots(fit.trajectory.knots.time_s, fit.observations.time_s)
     linearised = linearise(fit.observations, fit.trajectory.knots, at)
@@ -97,10 +82,7 @@ def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
 def residual_statistics(
     fit: TrajectoryFit, sources: Sequence[Measurement]
 ) -> dict[int, dict[str, ResidualStatistics]]:
-    """Summarise the normalised residuals by station and measured axis.
-
-    ``sources`` holds the measurement of each observation of the fit.
-    """
+    """Summarise the normalised residuals by station and measured axis; ``sources``: the measurement of each observation."""
     normalised = normalised_residuals(fit)
     station = np.array([source.station for source in sources])
     statistics: dict[int, dict[str, ResidualStatistics]] = {}

@@ -23,14 +23,9 @@ if TYPE_CHECKING:
 
 PANEL_HEIGHT_MM = 26.0
 
-BUCKETS = 1500
-"""About the number of dots across a page at 200 dpi."""
-
-MAX_SEGMENTS = 150
-"""Number of segments of a band."""
-
-HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++")
-"""Areas differ by hatching too, so that they are distinguishable in greyscale."""
+BUCKETS = 1500  # About the number of dots across a page at 200 dpi
+MAX_SEGMENTS = 150  # Number of segments of a band
+HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++")  # Distinguishable in greyscale
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,16 +30,9 @@ def draw_layouts(
 ) -> None:
     """Draw the layouts over the robot's heading, and the first one over distance and arrangement of the stations.
 
-    Parameters
-    ----------
-    covariances
-        By name of the layout, in the order of the ranking: (N, 6, 6) of robot poses with
-        :data:`tsgt.analysis.design.layout_study.HEADING_COUNT` headings at each place.
-    distances : By the stations' distance in m and the name of their arrangement.
-
-    Raises
-    ------
-    MissingExtraError, OutputFileError : matplotlib is not installed; the file cannot be written.
+    ``covariances``: by name in the order of the ranking, (N, 6, 6) of robot poses with
+    :data:`tsgt.analysis.design.layout_study.HEADING_COUNT` headings at each place. ``distances``: by the stations' distance
+    in m and the name of their arrangement. Raises MissingExtraError without matplotlib, OutputFileError if it cannot write.
     """
     heading_deg = np.arange(HEADING_COUNT + 1) * (360 / HEADING_COUNT)
     distance_m = list(distances)
@@ -81,14 +74,8 @@ def draw_perturbation(
 ) -> None:
     """Draw mean and standard deviation of the pose errors over the noise, per axis and of the norm.
 
-    Parameters
-    ----------
-    study : In the order of the noise.
-    first_order_per_mm : Sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
-
-    Raises
-    ------
-    MissingExtraError, OutputFileError : matplotlib is not installed; a file cannot be written.
+    ``study``: in the order of the noise. ``first_order_per_mm``: sigmas of position (m) and rotation (rad) for 1 mm of
+    noise, (3,) each. Raises as :func:`draw_layouts`.
     """
     noise_mm = np.array([1e3 * each.noise_m for each in study])
     position_mm = 1e3 * np.array(

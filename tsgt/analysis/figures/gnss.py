@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.figures.style import Stroke
     from tsgt.analysis.gnss import DistanceSeries, Receiver
 
-_SMALLEST_MM = 0.1
-"""Lower limit of the logarithmic axis; smaller errors are drawn here."""
+_SMALLEST_MM = 0.1  # Lower limit of the logarithmic axis; smaller errors are drawn here
 _LARGEST_AT_LEAST_MM = 10.0
 _BINS_PER_DECADE = 12
 _POINTS_PER_BIN = 10
@@ -42,19 +41,9 @@ def draw_gnss(
     prisms: Sequence[DistanceSeries],
     path: Path,
 ) -> None:
-    """Draw errors of distances between receivers, and between prisms if there are any.
+    """Draw median and 90 % band of the errors of distances between receivers, and between prisms if any, over their time.
 
-    Curves are medians, bands hold 90 % of the values.
-
-    Parameters
-    ----------
-    receivers : Drawn in the time interval of ``gnss``.
-    gnss, prisms : Distances between receivers, at least one; and between prisms, which are drawn together.
-
-    Raises
-    ------
-    MissingExtraError : matplotlib is not installed.
-    OutputFileError : The file cannot be written.
+    Raises MissingExtraError if matplotlib is not installed, OutputFileError if the file cannot be written.
     """
     series = [_series(f"receivers {pair.name}", [pair]) for pair in gnss if len(pair.times_ns)]
     if prisms:

@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-PAGE_WIDTH_MM = 180.0
-"""Width of both columns of most journals."""
-
+PAGE_WIDTH_MM = 180.0  # Width of both columns of most journals
 FORMATS = (".png", ".pdf", ".svg")
 
 
@@ -67,12 +65,7 @@ _STYLE: dict[Any, Any] = {
 
 @contextmanager
 def drawing(*, width_mm: float, height_mm: float) -> Iterator[Figure]:
-    """Yield an empty figure of this size on paper in the common style, to be saved before the block ends.
-
-    Raises
-    ------
-    MissingExtraError : matplotlib is not installed.
-    """
+    """Yield an empty figure of this size in the common style, to be saved inside; MissingExtraError without matplotlib."""
     try:
         import matplotlib as mpl  # noqa: PLC0415 (an extra)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -83,12 +76,7 @@ def drawing(*, width_mm: float, height_mm: float) -> Iterator[Figure]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the path's suffix, one of :data:`FORMATS`.
-
-    Raises
-    ------
-    OutputFileError : Another suffix, or the file cannot be written.
-    """
+    """Write a figure in the format of the suffix; OutputFileError if it is not in :data:`FORMATS`, or writing fails."""
     if path.suffix not in FORMATS:
         raise OutputFileError(f"figures end in {', '.join(FORMATS)}", path=path)
     # Without a date, so that the same numbers give the same file.

@@ -140,9 +140,7 @@ class Row:
 def read_table(path: Path) -> tuple[Header, Iterator[Row]]:
     """Read header and rows of a CSV file; blank lines and comments (``#``) are ignored.
 
-    Raises
-    ------
-    InputFileError : The file cannot be read or has no rows; on iteration: a row has not as many cells as the header.
+    Raises InputFileError if it cannot be read or has no rows; on iteration: if a row has not as many cells as the header.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark

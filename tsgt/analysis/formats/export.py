@@ -1,7 +1,4 @@
-"""Poses and measurements in the formats of other programs: TUM for evo, CSV for spreadsheets.
-
-docs/reference/csv.md describes the columns of the CSV files.
-"""
+"""Poses and measurements as TUM for evo, and as CSV for spreadsheets (columns: docs/reference/csv.md)."""
 
 from __future__ import annotations
 
@@ -35,11 +32,9 @@ MEASUREMENT_COLUMNS = (
 
 
 def tum_lines(poses: Iterable[tuple[int, Sequence[float], Sequence[float]]]) -> Iterator[str]:
-    """Format poses as the TUM RGB-D benchmark does: ``stamp_s x y z qx qy qz qw``.
+    """Format valid poses (Unix ns; m; unit quaternion x, y, z, w) as the TUM benchmark does: ``stamp_s x y z qx qy qz qw``.
 
-    ``poses``: Valid poses: Unix time in ns, position in m, unit quaternion x, y, z, w.
-
-    Yields one line per pose: seconds with nine decimals, exact to the nanosecond; metres to the nanometre.
+    Seconds with nine decimals, exact to the nanosecond; metres to the nanometre.
     """
     row = "{:d}.{:09d} {:.9f} {:.9f} {:.9f} {:.12f} {:.12f} {:.12f} {:.12f}\n".format
     for stamp_ns, position_m, orientation_xyzw in poses:

@@ -59,12 +59,7 @@ class Message(NamedTuple):
 
 
 def write_mcap(file: BinaryIO, messages: Iterable[Message]) -> None:
-    """Write messages in the order given; log time and publish time are ``stamp_ns``.
-
-    Raises
-    ------
-    MissingExtraError : mcap or rosbags is not installed.
-    """
+    """Write messages in the order given, at ``stamp_ns``. Raises MissingExtraError if mcap or rosbags is not installed."""
     try:
         from mcap.writer import Writer  # noqa: PLC0415 (an extra)
     except ImportError as error:
@@ -91,18 +86,9 @@ def write_mcap(file: BinaryIO, messages: Iterable[Message]) -> None:
 def messages(
     recording: Recording, poses: Iterable[PoseRecord], reference: Reference | None = None
 ) -> Iterator[Message]:
-    """Yield all messages in the order of time.
+    """Yield prism positions, valid ones of ``poses`` (in the order of time) and the reference, if any, in the order of time.
 
-    Parameters
-    ----------
-    recording : Measurements, from which the prism positions are computed, and the frames of stations and prisms.
-    poses : In the order of time; invalid ones are skipped.
-    reference : A reference trajectory for display together with the poses.
-
-    Raises
-    ------
-    MessageError : A time is after January 2038, which ROS 2 cannot represent.
-    MissingExtraError : rosbags is not installed.
+    Raises MessageError if a time is after January 2038, which ROS 2 cannot represent; MissingExtraError without rosbags.
     """
     tracks = build_tracks(recording.parameters, recording.measurements)
     sources = [_pose_messages(poses), *(_track_messages(prism, track) for prism, track in tracks.items())]

@@ -12,31 +12,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MAX_STATIONARY_SPEED_MPS = 0.01
-MAX_STATIONARY_RATE_RADPS = 0.01
-"""A robot below both limits is stationary: encoders at rest count next to nothing."""
-
+MAX_STATIONARY_RATE_RADPS = 0.01  # Below both: encoders at rest count next to nothing
 MIN_STATIONARY_NS = 3_000_000_000
-MAX_SAMPLE_GAP_NS = 1_000_000_000
-"""Between two lines further apart than this the motion is unknown."""
+MAX_SAMPLE_GAP_NS = 1_000_000_000  # Between two lines further apart than this the motion is unknown
 
 
 def read_stationary_intervals(path: Path) -> list[tuple[int, int]]:
-    """Read the intervals in which a robot was stationary for 3 s or more.
+    """Read the intervals in which a robot was stationary for 3 s or more: start and end in Unix ns, in the order of time.
 
-    Parameters
-    ----------
-    path
-        Lines of ``time_s,linear_mps,angular_radps``: Unix time in s, speed in m/s, angular rate in rad/s, separated by commas,
-        semicolons or spaces. The first line may name the columns; ``#`` starts a comment.
-
-    Returns
-    -------
-    list of (int, int)
-        Start and end of each interval in Unix ns, in the order of time.
-
-    Raises
-    ------
-    InputFileError : It cannot be read, a line is not three finite numbers, or times do not increase.
+    Lines are ``time_s,linear_mps,angular_radps``: Unix time in s, speed in m/s, angular rate in rad/s, separated by commas,
+    semicolons or spaces. The first line may name the columns; ``#`` starts a comment. Raises InputFileError if the file
+    cannot be read, a line is not three finite numbers, or times do not increase.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

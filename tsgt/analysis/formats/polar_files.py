@@ -1,7 +1,4 @@
-"""Tracks of raw polar measurements: what ``tsgt export --format csv --records measurements`` writes.
-
-docs/reference/csv.md describes the columns.
-"""
+"""Tracks of raw polar measurements as ``tsgt export --format csv --records measurements`` writes; docs/reference/csv.md."""
 
 from __future__ import annotations
 
@@ -30,15 +27,9 @@ _OPTIONAL = (
 def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
     """Read the measurements of one drive in the order of arrival; without ``received_ns`` that is the time of measurement.
 
-    Parameters
-    ----------
-    paths
-        One file with all stations, or one per station. In a file without a column ``station`` all lines belong to the
-        station whose number is the position of the file, from 1.
-
-    Raises
-    ------
-    InputFileError : A file cannot be read, is empty, has a wrong column or number, or contains a measurement twice.
+    One file has all stations, or one per station: without a column ``station`` all lines belong to the station whose number
+    is the position of the file, from 1. Raises InputFileError if a file cannot be read, is empty, has a wrong column or
+    number, or contains a measurement twice.
     """
     measurements: list[Measurement] = []
     counts: dict[int, int] = {}
@@ -143,12 +134,7 @@ def tracked_prisms(measurements: Sequence[Measurement]) -> dict[int, int]:
 
 
 def check_tracks(measurements: Sequence[Measurement], paths: Sequence[Path]) -> None:
-    """Raise if no measurement is usable or the stations' measurements do not overlap in time.
-
-    Raises
-    ------
-    InputFileError : Names the stations.
-    """
+    """Raise InputFileError, which names the stations, if no measurement is usable or the stations do not overlap in time."""
     spans: dict[int, tuple[int, int]] = {}
     for m in measurements:
         if m.status.usable:

@@ -45,9 +45,7 @@ GPS_EPOCH_NS = 315_964_800 * SECOND_NS  # 1980-01-06
 _UNIX_EPOCH_DAY = date(1970, 1, 1).toordinal()
 _FIRST_YEAR, _LAST_YEAR, _LAST_WEEK = 1980, 2199, 11_000
 
-_MAX_COORDINATE_M = 1e8
-"""Upper limit of coordinates: no receiver is so far from the Earth or its base."""
-
+_MAX_COORDINATE_M = 1e8  # Upper limit of coordinates: no receiver is so far from the Earth or its base
 _FIRST_COLUMN: dict[str, tuple[Coordinates, bool]] = {
     "latitude(deg)": ("geodetic", False),
     "latitude(d'\")": ("geodetic", True),
@@ -113,12 +111,9 @@ class _Place:
 def read_pos(path: Path) -> PosFile:
     """Read a solution file as RTKPOST, rnx2rtkp or RTKNAVI write it with the header switched on, sorted by time.
 
-    Columns are separated by spaces, tabs, commas or semicolons. A backward solution is stored last epoch first.
-
-    Raises
-    ------
-    InputFileError
-        No header or one of another format, a truncated or invalid line, a duplicate epoch, no positions at all.
+    Columns are separated by spaces, tabs, commas or semicolons. A backward solution is stored last epoch first. Raises
+    InputFileError without a header, for another format, a truncated or invalid line, a duplicate epoch, or no positions at
+    all.
     """
     columns: _Columns | None = None
     base: tuple[list[str], _Place] | None = None

@@ -37,11 +37,8 @@ class PublishedTrack:
 def read_track(path: Path) -> PublishedTrack:
     """Read the authors' ``trimble<k>.csv``: no header, separated by spaces: Unix time (s), x, y, z (m) in frame 1.
 
-    The times are converted from decimal text to nanoseconds without a float.
-
-    Raises
-    ------
-    InputFileError : The file is empty, a line has not four finite numbers, or times do not increase.
+    Decimal times are converted to ns without a float. Raises InputFileError if the file is empty, a line has not four finite
+    numbers, or times do not increase.
     """
     stamps: list[int] = []
     points: list[list[float]] = []
@@ -74,12 +71,7 @@ def read_track(path: Path) -> PublishedTrack:
 
 
 def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
-    """Read the tracks of one drive, in the order of the prisms.
-
-    Raises
-    ------
-    InputFileError : As :func:`read_track`; also if the tracks do not overlap in time.
-    """
+    """Read the tracks of one drive in the order of the prisms. Raises InputFileError also if they do not overlap in time."""
     tracks = tuple(read_track(path) for path in paths)
     latest = max(range(len(tracks)), key=lambda i: int(tracks[i].stamps_ns[0]))
     first_to_end = min(range(len(tracks)), key=lambda i: int(tracks[i].stamps_ns[-1]))
@@ -93,20 +85,11 @@ def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
 
 
 def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPosition, ...]:
-    """Read the prism positions on the robot, in the order of ``numbers``.
+    """Read the positions of the tracked prisms on the robot, in the order of ``numbers``.
 
-    Parameters
-    ----------
-    path
-        The authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, starting with x, y, z
-        in m in the robot frame; the rest (other sensors, covariances) is ignored. With the suffix ``.toml`` our own
-        set-up file of kind ``prism_layout``.
-    numbers : Tracked prisms; others are ignored.
-
-    Raises
-    ------
-    InputFileError : A row or a number is missing, or the prisms coincide or lie in a line.
-    ConfigError : The set-up file cannot be used.
+    From the authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, starting with x, y, z
+    in m in the robot frame, the rest is ignored; or from a ``.toml`` of kind ``prism_layout``. Raises InputFileError if a
+    row or a number is missing, or the prisms coincide or lie in a line; ConfigError if the set-up file cannot be used.
     """
     positions = load_prism_layout(path) if path.suffix == ".toml" else _read_sensor_positions(path)
     missing = [prism for prism in numbers if prism not in positions]

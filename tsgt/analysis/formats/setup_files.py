@@ -55,17 +55,10 @@ def write_station_frames(
 def write_prism_layout(
     path: Path, positions_m: Mapping[int, FloatArray], sigmas_m: Mapping[int, FloatArray], *, comment: str
 ) -> None:
-    """Write a file of kind ``prism_layout``, atomically.
+    """Write a file of kind ``prism_layout``, atomically, with a comment line at the top that states the origin.
 
-    Parameters
-    ----------
-    positions_m, sigmas_m
-        (3,) position in the frame ``robot`` in m, and one sigma of each coordinate, by prism number.
-    comment : Origin of the positions, written as one comment line at the top.
-
-    Raises
-    ------
-    OutputFileError : The file cannot be written.
+    By prism number: (3,) position in the frame ``robot`` in m, and one sigma of each coordinate. Raises OutputFileError if
+    the file cannot be written.
     """
     tables = {
         str(prism): {"position_m": list(map(float, position)), "sigma_m": list(map(float, sigmas_m[prism]))}

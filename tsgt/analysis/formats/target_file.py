@@ -1,7 +1,4 @@
-"""Target files (several stations) and prism files (one station, prisms and body points of the robot).
-
-docs/reference/target-file.md describes both formats and the authors' marker file.
-"""
+"""Target files (several stations) and prism files (prisms and body points): see docs/reference/target-file.md."""
 
 from __future__ import annotations
 
@@ -44,10 +41,7 @@ class TargetMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class TargetFile:
-    """Measurements of common targets by several stations, by station number and target number: at least one each.
-
-    ``skipped`` has one sentence for each line that was skipped because of an error status.
-    """
+    """Measurements of common targets by station and target number, at least one each, and a sentence for each skipped line."""
 
     path: Path
     measurements: dict[int, dict[int, list[TargetMeasurement]]]
@@ -56,10 +50,7 @@ class TargetFile:
 
 @dataclass(frozen=True, slots=True)
 class PrismFile:
-    """Measurements of the robot's prisms (by number) and body points (by name), at least one each.
-
-    ``cad_m``: position of each body point in the frame ``robot`` from CAD.
-    """
+    """Measurements of prisms (by number) and body points (by name), at least one each; CAD positions in ``robot``."""
 
     path: Path
     prisms: dict[int, list[TargetMeasurement]]
@@ -68,14 +59,10 @@ class PrismFile:
 
 
 def read_target_file(path: Path) -> TargetFile:
-    """Read targets measured by station 1 and at least one other, from our CSV or the authors' marker file.
+    """Read targets measured by station 1 and at least one other, from our CSV or the authors' marker file, by the header line.
 
-    The header line tells the formats apart. Marker lines with a status other than 0 are skipped (paper section III-D,
-    first step).
-
-    Raises
-    ------
-    InputFileError : The file cannot be read, is empty, has a wrong column or number, or a station is missing.
+    Marker lines with a status other than 0 are skipped (paper section III-D, first step). Raises InputFileError if the file
+    cannot be read, is empty, has a wrong column or number, or a station is missing.
     """
     file = read_partial_target_file(path)
     if 1 not in file.measurements:
@@ -88,12 +75,7 @@ def read_target_file(path: Path) -> TargetFile:
 
 
 def read_partial_target_file(path: Path) -> TargetFile:
-    """Read a target file as :func:`read_target_file` does, with any stations.
-
-    Raises
-    ------
-    InputFileError : The file cannot be read, is empty, or has a wrong column or number.
-    """
+    """Read a target file as :func:`read_target_file` does, with any stations."""
     header, rows = read_table(path)
     measurements: dict[int, dict[int, list[TargetMeasurement]]] = {}
     skipped: list[str] = []
@@ -119,12 +101,8 @@ def read_partial_target_file(path: Path) -> TargetFile:
 def read_prism_file(path: Path) -> PrismFile:
     """Read prisms and body points, at least one each, measured by one station.
 
-    Each line of the CSV is a ``prism`` or a ``body`` point, the latter with its position from CAD.
-
-    Raises
-    ------
-    InputFileError
-        The file cannot be read, is empty, has a wrong column or number, or contains no prism or no body point.
+    Each line of the CSV is a ``prism`` or a ``body`` point, the latter with its position from CAD. Raises InputFileError if
+    the file cannot be read, is empty, has a wrong column or number, or lacks prisms or body points.
     """
     header, rows = read_table(path)
     header.expect([["point"], ["kind"], *_MEASUREMENT_COLUMNS, *([name] for name in _CAD)], ["constant_mm"])

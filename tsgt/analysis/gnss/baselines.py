@@ -31,14 +31,9 @@ if TYPE_CHECKING:
 
 JST_OFFSET_NS = 9 * 3600 * SECOND_NS
 
-OUTAGE_LIMIT_NS = SECOND_NS
-"""The second receiver is not interpolated between positions further apart, as the paper does for prisms."""
-
-INSIDE_EARTH_M = 6.3e6
-"""Positions below this distance from the Earth's centre are invalid: RTKLIB writes the centre itself without a solution."""
-
-QUALITY_ORDER = (1, 2, 6, 4, 3, 5, 7, 0)
-"""RTKLIB's Q, best first."""
+OUTAGE_LIMIT_NS = SECOND_NS  # No interpolation across more, as the paper does for prisms
+INSIDE_EARTH_M = 6.3e6  # From the Earth's centre; RTKLIB writes the centre itself without a solution
+QUALITY_ORDER = (1, 2, 6, 4, 3, 5, 7, 0)  # RTKLIB's Q, best first
 _RANK = np.argsort(QUALITY_ORDER)
 
 
@@ -133,10 +128,7 @@ class DistanceSeries:
 def receivers(files: Sequence[PosFile]) -> tuple[Receiver, ...]:
     """Convert solutions to Unix time and one local frame, tangential to the WGS84 ellipsoid at the first position of the first.
 
-    Raises
-    ------
-    InputFileError : A file contains no position at all.
-    MissingExtraError : pymap3d is not installed.
+    Raises InputFileError if a file contains no position at all, MissingExtraError if pymap3d is not installed.
     """
     try:
         from pymap3d import ecef2enu, ecef2geodetic  # noqa: PLC0415 (an extra)
@@ -206,23 +198,12 @@ def _ecef_m(file: PosFile) -> NDArray[np.float64]:
 def receiver_distances(
     found: Sequence[Receiver], references_m: Sequence[float] | None = None
 ) -> tuple[DistanceSeries, ...]:
-    """Measure the distances between all receivers over time.
+    """Measure the distances between all receivers over time, one series per pair.
 
     The second receiver of a pair is interpolated linearly to the epochs of the first, because the clocks of low-cost
-    receivers differ by some milliseconds.
-
-    Parameters
-    ----------
-    found : As :func:`receivers` returns them.
-    references_m
-        True distances for the pairs 1-2, 1-3, ..., 2-3, ...; None: the median of the distances from fixed positions (Q = 1),
-        or of all without fixed ones. A median hides constant errors.
-
-    Returns
-    -------
-    tuple of DistanceSeries
-        One per pair. Invalid are epochs of the first receiver outside the time of the second or between two of its
-        positions more than 1 s apart.
+    receivers differ by some milliseconds; invalid are epochs outside its time or between positions more than 1 s apart. The
+    references are for the pairs 1-2, 1-3, ..., 2-3, ...; without them the median of the distances from fixed positions (Q =
+    1), or of all without fixed ones, which hides constant errors.
     """
     pairs = []
     for number, (a, b) in enumerate(combinations(found, 2)):
@@ -268,14 +249,7 @@ def prism_distances(
 ) -> tuple[DistanceSeries, ...]:
     """Measure the distances between all prisms over time, as ``tsgt evaluate`` does: at 20 Hz, all pairs or none.
 
-    Parameters
-    ----------
-    parameters : The prism layout (the reference distances) and the outage limit.
-    tracks : One track per prism of the layout, in frame ``station1``.
-
-    Raises
-    ------
-    RecordingError : A prism was not measured, or the layout has only one prism.
+    ``tracks``: one per prism, in frame ``station1``. Raises RecordingError if a prism was not measured or there is only one.
     """
     missing = [prism.prism for prism in parameters.prisms if not len(tracks[prism.prism])]
     if missing or len(parameters.prisms) < 2:
@@ -298,12 +272,7 @@ def prism_distances(
 def common_interval(
     gnss: Sequence[DistanceSeries], prisms: Sequence[DistanceSeries], path: Path
 ) -> tuple[tuple[DistanceSeries, ...], tuple[DistanceSeries, ...]]:
-    """Cut distances between receivers and between prisms to the time interval that both cover.
-
-    Raises
-    ------
-    RecordingError : They do not overlap in time.
-    """
+    """Cut distances between receivers and between prisms to their common time. Raises RecordingError if there is none."""
     gnss_span, prism_span = time_span(gnss), time_span(prisms)
     if gnss_span is None or prism_span is None:
         which = "receivers" if gnss_span is None else "prisms"

@@ -1,7 +1,4 @@
-"""Relates the journals of one boot of a station's computer to a session of the master: common measurements, and times.
-
-Sans-I/O.
-"""
+"""Relates the journals of one boot of a station to a session of the master by common measurements and times. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -30,17 +27,10 @@ if TYPE_CHECKING:
     from tsgt.model import ClockSample, PolarMeasurement
     from tsgt.recording.journal import Journal
 
-_ROUGH_NS = 5_000_000_000
-"""A delivered measurement relates the station's clock to the master's within this, even without a timestamp bound."""
-
-_EARLY_NS = 1_000_000_000
-"""A response this long before the journal's start, on the master's clock, may belong to the journal."""
-
-_DRIFT = 200e-6
-"""Upper limit of the frequency difference of two computers' clocks."""
-
-_AFTER_NS = 10_000_000_000
-"""A synchronisation this long after a journal's last line still belongs to it, if no other journal has begun."""
+_ROUGH_NS = 5_000_000_000  # Accuracy of a delivered measurement without a timestamp bound
+_EARLY_NS = 1_000_000_000  # A response this long before the journal's start may belong to it
+_DRIFT = 200e-6  # Upper limit of the frequency difference of two computers' clocks
+_AFTER_NS = 10_000_000_000  # Until then a synchronisation belongs to a journal without successor
 
 # Half a unit of the protocol plus rounding errors of the sums; distances from 1677.7 m on are sent in whole mm.
 _ANGLE_ROUNDING_RAD = math.tau / 2**25 * 1.001

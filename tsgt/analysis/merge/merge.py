@@ -29,13 +29,8 @@ if TYPE_CHECKING:
     from tsgt.analysis.merge.timing import MasterTime
     from tsgt.recording.journal import Journal
 
-SESSION_MARGIN_NS = 120_000_000_000
-"""Measurements longer before the master's start or after its end are not part of its session. Within two minutes they may be:
-a crashed master is restarted by then.
-"""
-
-MAX_TIME_BOUND_NS = 50_000_000
-"""Measurements with a larger time bound are not merged: at 1.5 m/s that is 75 mm, and a gap does less harm."""
+SESSION_MARGIN_NS = 120_000_000_000  # Before the start or after the end; a crashed master restarts sooner
+MAX_TIME_BOUND_NS = 50_000_000  # At 1.5 m/s that is 75 mm; a gap does less harm
 
 
 @dataclass(slots=True)

@@ -49,9 +49,9 @@ class _Stamped:
 
 
 def identity(measurement: PolarMeasurement) -> Identity | None:
-    """Return what identifies a measurement; None if the station's own time was not transmitted.
+    """Return what identifies a measurement: not the time alone, which a computer without a battery-backed clock may repeat.
 
-    The time alone is ambiguous: a computer without a battery-backed clock may repeat the same hour each day.
+    None if the station's own time was not transmitted.
     """
     if measurement.host_time_ns is None:
         return None
@@ -67,14 +67,7 @@ def identity(measurement: PolarMeasurement) -> Identity | None:
 def index_recording(
     path: Path, *, keep_going: bool = False, on_problem: Callable[[RecordingError], None] | None = None
 ) -> RecordingIndex:
-    """Read a recording.
-
-    ``path``, ``keep_going``, ``on_problem``: See :func:`~tsgt.recording.load_recording`.
-
-    Raises
-    ------
-    RecordingError : As :func:`~tsgt.recording.load_recording`; also for a file that was not written by a master.
-    """
+    """Read a recording as :func:`~tsgt.recording.load_recording` does. Raises RecordingError also if no master wrote it."""
     index = RecordingIndex()
     for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
         if line.type == "journal":

@@ -21,15 +21,10 @@ if TYPE_CHECKING:
     from tsgt.model import ClockSample
     from tsgt.timesync.two_way import ClockEstimate
 
-_CONFIRMED = 2
-"""Minimal number of accepted clock samples in a synchronisation; a single one may be delayed."""
-
+_CONFIRMED = 2  # Minimal number of accepted clock samples in a synchronisation; a single one may be delayed
 _MIN_RECEPTIONS_AFTER = 100
-_MIN_TIME_AFTER_NS = 60_000_000_000
-"""A time depends on the beacons before it and on those after it up to both of these limits."""
-
-_MAX_LINK_DELAY_NS = 100_000_000
-"""Upper limit of the link delay: RxDone follows within a symbol of the packet's end, and none lasts longer than 33 ms."""
+_MIN_TIME_AFTER_NS = 60_000_000_000  # Beacons before and after it count up to both limits
+_MAX_LINK_DELAY_NS = 100_000_000  # RxDone is within a symbol, at most 33 ms, of the packet's end
 
 
 class MasterTime(NamedTuple):
@@ -59,17 +54,10 @@ class DeliveredTime(NamedTuple):
 def times_from_synchronisations(
     synchronisations: Sequence[Sequence[ClockSample]], stamps_ns: Sequence[int]
 ) -> list[MasterTime | None]:
-    """Convert station times to the master's clock, using two-way exchanges before and after them.
+    """Convert increasing station times to the master's clock, using the two-way exchanges before and after each.
 
-    Parameters
-    ----------
-    synchronisations : Exchanges with the station in the order of time; at least one, none of them empty.
-    stamps_ns : Increasing.
-
-    Returns
-    -------
-    list[MasterTime | None]
-        One per timestamp; None between two synchronisations that no single clock can explain.
+    There is at least one synchronisation, in the order of time, none empty. None between two that no single clock can
+    explain.
     """
     clock = RegressionFilter()
     times: list[MasterTime | None] = [None] * len(stamps_ns)
@@ -117,17 +105,9 @@ def _between(before: _ClockFix, after: _ClockFix, stamp_ns: int) -> MasterTime:
 def times_from_beacons(
     receptions: Sequence[BeaconReception], stamps_ns: Sequence[int]
 ) -> list[MasterTime | None]:
-    """Convert station times to the master's clock, without the link delay, using beacons before and after them.
+    """Convert increasing station times to the master's clock, without the link delay: when a beacon received then was sent.
 
-    Parameters
-    ----------
-    receptions : Beacons of one session of the master, in the order of reception.
-    stamps_ns : Increasing.
-
-    Returns
-    -------
-    list[MasterTime | None]
-        When a beacon received at the timestamp would have been sent. None without receptions.
+    Uses the beacons of one session before and after each, in the order of reception. None without receptions.
     """
     clock = BeaconClock()
     times: list[MasterTime | None] = []
@@ -160,10 +140,7 @@ def times_from_beacons(
 
 
 def link_delay(delivered: Sequence[DeliveredTime]) -> tuple[int, int] | None:
-    """Return the link delay that the master applied to a station's times, and its bound, in ns; None if unfix.
-
-    The recorded times of delivered measurements include it.
-    """
+    """Return link delay, which recorded times of delivered measurements include, and its bound, in ns; None if not fixed."""
     delays_ns = [each.recorded_ns - each.computed.unix_ns for each in delivered]
     if not delays_ns:
         return None
@@ -177,7 +154,7 @@ def link_delay(delivered: Sequence[DeliveredTime]) -> tuple[int, int] | None:
 
 
 def times_consistent(recorded_ns: int, recorded_bound_ns: int, computed: MasterTime) -> bool:
-    """Return whether a recorded time can be the one computed from beacons, whose link delay is unfix."""
+    """Return whether a recorded time can be the one computed from beacons, whose link delay is not fixed."""
     return abs(recorded_ns - computed.unix_ns) <= recorded_bound_ns + computed.bound_ns + _MAX_LINK_DELAY_NS
 
 

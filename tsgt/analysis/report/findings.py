@@ -155,18 +155,9 @@ def collect_findings(
 ) -> Findings:
     """Compute the content of a report.
 
-    Parameters
-    ----------
-    path : The recording's file.
-    reference : Trajectory to compare poses with.
-    with_held_out : Cross-validate both estimators.
-    align : Compare with the reference after this alignment as well.
-    stationary_ns : Stationary intervals from another source than the measurements.
-    on_progress : Called with the completed fraction, 0 to 1.
-
-    Raises
-    ------
-    RecordingError : There is no measurement at all, or the file cannot be read.
+    ``reference``: trajectory to compare poses with, unaligned and after ``align``; ``with_held_out``: cross-validate both
+    estimators; ``stationary_ns``: from another source than the measurements; ``on_progress`` gets the fraction, 0 to 1.
+    Raises RecordingError if there is no measurement at all, or the file cannot be read.
     """
     report = on_progress or (lambda _: None)
     parameters = recording.parameters

@@ -67,13 +67,9 @@ class Log:
 
 
 def read_log(path: Path) -> Log:
-    """Read status, clock and event records; unreadable lines are skipped.
+    """Read status, clock and event records, for illustration only; unreadable lines are skipped.
 
-    They only illustrate: results come from :func:`tsgt.recording.load_recording`, which checks each line.
-
-    Raises
-    ------
-    RecordingError : The file cannot be read.
+    Raises RecordingError if the file cannot be read.
     """
     statuses: list[dict[str, Any]] = []
     clocks: dict[int, list[dict[str, Any]]] = defaultdict(list)

@@ -18,15 +18,14 @@ if TYPE_CHECKING:
     from tsgt.model import Parameters
 
 BINS = 8
-MIN_BIN_COUNT = 20
-"""One second of epochs: bins with fewer have no statistics."""
+MIN_BIN_COUNT = 20  # One second of epochs: bins with fewer have no statistics
 
 
 @dataclass(frozen=True, slots=True)
 class RobotMotion:
-    """Motion of a robot at N epochs; NaN where no pose is valid.
+    """Motion of a robot at N epochs, (N,) each; NaN without a valid pose.
 
-    Speed of the prisms' centroid, its derivative (negative while braking), and norm of the angular velocity, (N,) each.
+    Speed of the prisms' centroid, its derivative (negative while braking), and norm of the angular velocity.
     """
 
     speed_mps: FloatArray
@@ -41,10 +40,7 @@ class RobotMotion:
 
 @dataclass(frozen=True, slots=True)
 class DistanceErrorSeries:
-    """Inter-prism errors and motion of the robot at N 20 Hz epochs in the time that all tracks cover.
-
-    ``error_m``: by name of the pair, (N,) measured distance minus that of the layout; NaN where a track has a gap.
-    """
+    """Inter-prism errors (measured minus layout, (N,) by pair; NaN in a gap) and motion at 20 Hz where all tracks have data."""
 
     stamp_ns: NDArray[np.int64]
     error_m: dict[str, FloatArray]
@@ -102,13 +98,7 @@ def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64])
 
 
 def binned(error_m: FloatArray, quantity: FloatArray) -> Bins | None:
-    """Sort |error| by a quantity; None with too few values.
-
-    Parameters
-    ----------
-    error_m : (P, N) of P pairs at N epochs; NaN if unknown.
-    quantity : (N,); NaN if unknown.
-    """
+    """Sort |error|, (P, N) of P pairs, by a quantity, (N,), NaN if unknown; None with too few values."""
     edges = _edges(quantity)
     if edges is None:
         return None

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.report.verdicts import Verdict
     from tsgt.geometry import FloatArray
 
-MAX_LISTED = 20
-"""Rows of a table that may be long."""
-
+MAX_LISTED = 20  # Rows of a table that may be long
 _MARK = {
     Level.GOOD: ("good", "\N{CHECK MARK}"),
     Level.CARE: ("care", "!"),
@@ -103,12 +101,7 @@ def render_page(
     sections: Sequence[Section],
     images: Mapping[str, bytes],
 ) -> str:
-    """Render a report as one HTML page without external resources; ``images`` holds PNG files by name of the figure.
-
-    Raises
-    ------
-    MissingExtraError : jinja2 is not installed.
-    """
+    """Render one HTML page without external resources; ``images``: PNG by figure. Raises MissingExtraError without jinja2."""
     try:
         from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (an extra)
     except ImportError as error:

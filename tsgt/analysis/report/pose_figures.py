@@ -132,13 +132,7 @@ def draw_residuals(
     station: NDArray[np.int64],
     axis: TimeAxis,
 ) -> None:
-    """Draw the normalised residuals of each station over time.
-
-    Parameters
-    ----------
-    normalised : (M, 3) in sigmas, along the line of sight, horizontally and vertically across it.
-    stamp_ns, station : (M,) of the measurements.
-    """
+    """Draw residuals (M, 3), in sigmas along, horizontally and vertically across the line of sight, by station over time."""
     numbers = np.unique(station).tolist()
     axes = figure.subplots(len(numbers), 3, sharex=True, sharey=True, squeeze=False)
     for row, number in enumerate(numbers):

@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 def draw_gaps(
     figure: Figure, stations: Sequence[StationRecord], axis: TimeAxis, outage_limit_s: float, end_ns: int
 ) -> None:
-    """Draw for each station the time between usable measurements, and unusable measurements.
-
-    The gaps before the first measurement of a station (from the first of any) and after its last (until ``end_ns``, the last
-    of any) are drawn too.
-    """
+    """Draw times without usable measurements, also from the first and to the last of any station, and unusable measurements."""
     axes = figure.subplots(len(stations), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for panel, station in zip(axes, stations, strict=True):
         times = station.stamp_ns[station.usable]

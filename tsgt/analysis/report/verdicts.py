@@ -1,7 +1,4 @@
-"""Verdicts: which results of a recording can be trusted, and what to check. Sans-I/O.
-
-The limits are guidelines that a correct set-up meets with a margin.
-"""
+"""Verdicts: which results can be trusted, and what to check, by limits that a correct set-up meets with a margin. Sans-I/O."""
 
 from __future__ import annotations
 

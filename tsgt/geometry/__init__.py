@@ -1,14 +1,8 @@
 """Mathematics of rigid bodies and polar measurements; sans-I/O, numpy and scipy only.
 
-In: polar measurements, station frames, prism layouts. Out: rotations and transforms (:mod:`~tsgt.geometry.rigid`),
-point-set registration, poses with covariances, interpolated tracks. Sub-rooms: ``trajectory``, the continuous-time
-estimator, and ``calibration``, station frames and prism layouts.
-
-Conventions (docs/explanation/conventions.md): SI units and radians, times in integer nanoseconds; ``T_a_b`` maps
-coordinates in frame b to frame a; quaternions are x, y, z, w with w >= 0; a pose covariance is 6x6 of
-(x, y, z, rotation about the fixed axes x, y, z) in the frame of the pose. Arrays are float64; functions broadcast over
-leading dimensions. Whatever lies between measurement and pose gives the same bits for an item alone as for the same
-item in a batch: live stream, replay and post-processing agree exactly.
+In: polar measurements, station frames, prism layouts. Out: transforms, registered point sets, poses with covariances,
+interpolated tracks. Conventions: docs/explanation/conventions.md. Whatever lies between measurement and pose gives the same
+bits for an item alone as in a batch: live stream, replay and post-processing agree exactly.
 """
 
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets

@@ -20,11 +20,8 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
 
-COLLINEAR_RATIO = 1e-6
-"""Points are collinear if their spread across their best line is less than this ratio of the spread along it."""
-
-ROUNDING = 1e-12
-"""A spread below this ratio of the coordinates is rounding error."""
+COLLINEAR_RATIO = 1e-6  # Spread across the best line to that along it; below, points are collinear
+ROUNDING = 1e-12  # A spread below this ratio of the coordinates is rounding error
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +69,8 @@ def align(
 
     Parameters
     ----------
-    source, target
-        (n, 3) the same n >= 3 points in either frame in m.
-    weights
-        (n,) positive; equal when not given. Only their ratios count.
+    source, target : (n, 3) the same n >= 3 points in either frame in m.
+    weights : (n,) positive; equal when not given. Only their ratios count.
     covariances
         (n, 3, 3) covariance of each residual (of both points together) in the target frame in m^2. When not given, the
         noise is taken as isotropic with variances inverse to the weights, its size estimated from the residuals with
@@ -128,9 +123,8 @@ def align(
 def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the derivative of the fitted rigid transform by the displacement of each of n points, (n, 6, 3).
 
-    Summed over the points, gain times displacement is (translation of the moved frame's origin, small rotation) in the
-    axes of ``points``, (n, 3) in m from that origin: the pseudo-inverse of ``[I, -skew(point)]`` with the fit's weights,
-    (n,), in blocks.
+    Summed over the points, gain times displacement is (translation of the moved frame's origin, small rotation) in the axes
+    of ``points``, (n, 3) in m from it: the pseudo-inverse of ``[I, -skew(point)]`` with the fit's weights, (n,), in blocks.
     """
     w = weights / weights.sum()
     mean = w @ points
@@ -146,18 +140,14 @@ def fit_gain(points: FloatArray, weights: FloatArray) -> FloatArray:
 def align_triplets(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
     """Closed-form alignment of three layout points, (3, 3), with N measured triplets, (N, 3, 3): item, point, coordinate.
 
-    In m, in the body and in the world frame. The optimum is that of :func:`align_many` to rounding.
-
-    Raises DegenerateGeometryError: the layout's points coincide or are collinear; a degenerate measured triplet is
-    marked instead.
+    In m, in the body and in the world frame. The optimum is that of :func:`align_many` to rounding. Raises
+    DegenerateGeometryError: the layout's points coincide or are collinear; a degenerate measured triplet is marked instead.
     Raises GeometryError: wrong shapes or numbers that are not finite.
 
-    Notes
-    -----
-    The optimum maps centroid to centroid and plane to plane; what remains is one angle in the plane. Let b1, b2, b3 be axes
-    of the layout with b3 its normal, (u_i, v_i) its points on b1, b2 from their centroid, and n the measured normal. With
-    U = sum u_i p_i and V = sum v_i p_i, the image r1 of b1 maximises U·r1 + V·(n x r1) = r1·(U - n x V), so r1 is the
-    direction of U - n x V: no trigonometry, no decomposition.
+    It maps centroid to centroid and plane to plane; what remains is one angle in the plane. Let b1, b2, b3 be axes of the
+    layout with b3 its normal, (u_i, v_i) its points on b1, b2 from their centroid, and n the measured normal. With U = sum
+    u_i p_i and V = sum v_i p_i, the image r1 of b1 maximises U·r1 + V·(n x r1) = r1·(U - n x V), so r1 is the direction of U
+    - n x V: no trigonometry, no decomposition.
     """
     layout = np.asarray(layout, dtype=np.float64)
     if layout.shape != (3, 3):
@@ -213,9 +203,9 @@ def _triangle(points: bytes) -> tuple[FloatArray, float, FloatArray, FloatArray,
 
 
 def align_many(layout: ArrayLike, points: ArrayLike) -> BatchAlignment:
-    """Alignment of a layout, (P, 3) in the body frame in m, with N measured sets, (N, P, 3) in the world frame in m.
+    """Align a layout, (P, 3) in the body frame, P >= 3, with N measured sets, (N, P, 3) in the world frame, both in m.
 
-    By one SVD each (Arun et al. 1987), equal weights; P >= 3. Raises as :func:`align_triplets`.
+    By one SVD each (Arun et al. 1987), equal weights. Raises as :func:`align_triplets`.
     """
     layout = _points(layout, "layout")
     batch = _batch(points, len(layout))
@@ -244,8 +234,7 @@ def spread_m(points: FloatArray) -> FloatArray:
 def check_spread(points: FloatArray, what: str) -> None:
     """Check that (n, 3) points in m, n >= 3, span a triangle; ``what`` names them in the plural in the message.
 
-    Raises DegenerateGeometryError: they coincide or are collinear; the message has the spread along and across their best
-    line.
+    Raises DegenerateGeometryError: they coincide or are collinear; with the spread along and across their best line.
     """
     along_m, across_m, _ = spread_m(points)
     rounding_m = ROUNDING * float(np.abs(points).max())

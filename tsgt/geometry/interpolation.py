@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
 
-NO_GAP_NS = -1
-"""``gap_ns`` of an epoch without a sample before or after it."""
+NO_GAP_NS = -1  # ``gap_ns`` of an epoch without a sample before or after it
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +44,10 @@ def interpolate(
 
     Parameters
     ----------
-    times_ns
-        (M,) sample times, strictly increasing; M may be 0.
-    points
-        (M, 3) sample positions in m.
-    epochs_ns
-        (N,) in any order.
-    outage_limit_ns
-        Longest valid interval between two samples, inclusive.
+    times_ns : (M,) sample times, strictly increasing; M may be 0.
+    points : (M, 3) sample positions in m.
+    epochs_ns : (N,) in any order.
+    outage_limit_ns : Longest valid interval between two samples, inclusive.
 
     Returns one row per epoch. An epoch on a sample belongs to the interval that ends there, so that it is decided as soon
     as that sample is known.
@@ -131,7 +126,7 @@ def interpolated_covariance(
 def interpolation_error_s2(fraction: FloatArray, gap_ns: NDArray[np.int64]) -> FloatArray:
     """Error of linear interpolation per unit of constant acceleration, in m per m/s^2: t_before t_after / 2.
 
-    ``fraction`` is the position of the epoch in the interval, 0 to 1, ``gap_ns`` the interval's length; of the same shape.
+    ``fraction``: position of the epoch in the interval, 0 to 1; ``gap_ns``: the interval's length; of the same shape.
     """
     gap_s = np.asarray(gap_ns) * 1e-9
     error_s2: FloatArray = (fraction * gap_s) * ((1 - fraction) * gap_s) / 2

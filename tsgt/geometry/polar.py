@@ -25,8 +25,7 @@ def polar_to_cartesian(
 ) -> FloatArray:
     """Points in the station frame, (..., 3) in m, of polar measurements with corrected slope distances.
 
-    Zenith angles above pi are of the second face, where the horizontal angle is turned by pi: both faces give the same
-    point.
+    Zenith angles above pi are of the second face, where the horizontal angle is turned by pi: the same point.
     """
     return np.asarray(distance_m)[..., None] * _direction(horizontal_angle_rad, zenith_angle_rad)
 
@@ -47,10 +46,7 @@ def cartesian_to_polar(points: ArrayLike) -> tuple[FloatArray, FloatArray, Float
 
 
 def corrected_distance(slope_distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
-    """Corrected slope distance in m: atmospheric correction in ppm of the raw distance, prism constant in m added.
-
-    The constant is not scaled: it is a length of glass, not of air.
-    """
+    """Corrected slope distance in m: atmospheric ppm of the raw distance, and the prism constant, which is not scaled."""
     return np.asarray(slope_distance_m, dtype=np.float64) * (1 + ppm * 1e-6) + constant_m
 
 
@@ -62,10 +58,7 @@ def raw_distance(distance_m: ArrayLike, *, constant_m: float, ppm: float) -> Flo
 def polar_jacobian(
     horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
 ) -> FloatArray:
-    """Jacobian of :func:`polar_to_cartesian`.
-
-    Returns (..., 3, 3): rows x, y, z; columns horizontal angle, zenith angle, distance (m/rad, m/rad, 1).
-    """
+    """Jacobian of :func:`polar_to_cartesian`, (..., 3, 3): x, y, z by horizontal angle, zenith angle (m/rad), distance (1)."""
     h, z, d = np.broadcast_arrays(
         *(np.asarray(a, dtype=np.float64) for a in (horizontal_angle_rad, zenith_angle_rad, distance_m))
     )
@@ -81,11 +74,9 @@ def polar_jacobian(
 
 
 def cartesian_jacobian(points: ArrayLike) -> FloatArray:
-    """Jacobian of :func:`cartesian_to_polar` at points, (..., 3) in m: the inverse of :func:`polar_jacobian`.
+    """Jacobian of :func:`cartesian_to_polar` at points, (..., 3) in m: the inverse of :func:`polar_jacobian`, (..., 3, 3).
 
     Raises GeometryError: a point lies on the station's vertical axis: its horizontal angle has no derivative.
-
-    Returns (..., 3, 3): rows horizontal angle, zenith angle, distance; columns x, y, z (rad/m, rad/m, 1).
     """
     x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
     horizontal_m = np.hypot(x, y)

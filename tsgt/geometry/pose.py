@@ -24,11 +24,8 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
 
-MIN_PRISM_DISTANCE_M = 0.01
-"""Prisms are several centimetres wide: centres closer than this are a mistake in the layout."""
-
-MIN_LAYOUT_RATIO = 0.01
-"""Smallest ratio of the layout's spread across its best line to that along it; below, noise dominates the roll about it."""
+MIN_PRISM_DISTANCE_M = 0.01  # Prisms are several centimetres wide: closer is a mistake
+MIN_LAYOUT_RATIO = 0.01  # Spread across the best line to that along it; below, noise dominates the roll
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +40,10 @@ class Poses:
 
 
 def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
-    """Fit the prism layout to measured prisms (paper section III-D), unweighted.
+    """Fit the prism layout, (P, 3) in the robot frame, P >= 3, to prisms, (N, P, 3) in the world, in m, in the same order.
 
-    ``layout`` is (P, 3) in the robot frame, P >= 3, ``points`` are (N, P, 3) in the world, both in m and in the same order.
-
-    Raises DegenerateGeometryError: fewer than three prisms in the layout, or they coincide or are collinear.
-    Raises GeometryError: wrong shapes or numbers that are not finite.
+    Unweighted (paper section III-D). Raises DegenerateGeometryError: fewer than three prisms in the layout, or they coincide
+    or are collinear. Raises GeometryError: wrong shapes or numbers that are not finite.
     """
     fit = (align_triplets if np.shape(layout)[:1] == (3,) else align_many)(layout, points)
     squares = dot(fit.residuals_m, fit.residuals_m)
@@ -66,9 +61,8 @@ def poses_from_prisms(layout: ArrayLike, points: ArrayLike) -> Poses:
 def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances: FloatArray) -> FloatArray:
     """Propagate prism noise through the unweighted fit, to first order.
 
-    From the layout, (P, 3) in the robot frame in m, ``R_world_robot``, (N, 3, 3), and the covariances of the measured
-    prisms, (N, P, 3, 3) in the world in m^2, to (N, 6, 6), symmetric: x, y, z of the robot's origin in m, rotation
-    about the world's axes in rad.
+    From the layout, (P, 3) in the robot frame in m, ``R_world_robot``, (N, 3, 3), and the prisms' covariances, (N, P, 3, 3)
+    in the world in m^2, to (N, 6, 6), symmetric: x, y, z of the origin in m, rotation about the world's axes in rad.
     """
     from_robot = rotation[:, None, None]
     gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
@@ -93,12 +87,9 @@ def interpolation_error_covariance(
 
     Parameters
     ----------
-    error_s2
-        (N, P) interpolation error per unit of acceleration: see :func:`tsgt.geometry.interpolation_error_s2`.
-    acceleration_sigma_mps2
-        One sigma, per axis, of the acceleration of the prisms' centroid.
-    angular_acceleration_sigma_radps2
-        One sigma, per axis, of the robot's angular acceleration.
+    error_s2 : (N, P) interpolation error per unit of acceleration: see :func:`tsgt.geometry.interpolation_error_s2`.
+    acceleration_sigma_mps2 : One sigma, per axis, of the acceleration of the prisms' centroid.
+    angular_acceleration_sigma_radps2 : One sigma, per axis, of the robot's angular acceleration.
 
     Returns (N, 6, 6), to be added to :func:`pose_covariance`, with the same arguments and axes.
     """
@@ -129,9 +120,8 @@ def twists(
 def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> None:
     """Check that a prism layout, (P, 3) in the robot frame in m, determines poses well; ``names`` are for messages.
 
-    Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or
-    all of them nearly collinear (:data:`MIN_LAYOUT_RATIO`).
-    Raises GeometryError: wrong shape or numbers that are not finite.
+    Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all
+    nearly collinear (:data:`MIN_LAYOUT_RATIO`). Raises GeometryError: wrong shape or numbers that are not finite.
     """
     array = np.asarray(layout, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:

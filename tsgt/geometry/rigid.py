@@ -1,11 +1,8 @@
-"""Rotations and rigid transforms; Lie group operations of SO(3).
+"""Rotations and rigid transforms; Lie group operations of SO(3). ``T_a_b`` maps coordinates in frame b to frame a.
 
-``T_a_b`` maps coordinates in frame b to frame a. All functions broadcast over leading dimensions and, unless stated
-otherwise, give the same bits for an item alone as in a batch: element by element, no reduction over a batch.
-
-Source: T. D. Barfoot, "State Estimation for Robotics", section 7.1; G. S. Chirikjian, "Stochastic Models, Information
-Theory, and Lie Groups", volume 2, section 10.8. Coefficients that lose digits at small angles multiply terms too small
-for the loss to matter.
+All functions broadcast over leading dimensions and, unless stated otherwise, give the same bits for an item alone as in a
+batch. Source: T. D. Barfoot, "State Estimation for Robotics", section 7.1; G. S. Chirikjian, "Stochastic Models, Information
+Theory, and Lie Groups", volume 2, section 10.8.
 """
 
 from __future__ import annotations
@@ -22,12 +19,8 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-RIGID_TOLERANCE = 1e-6
-"""Allowed deviation of R^T R from the identity: that of a matrix typed with six decimals."""
-
-TINY = 1e-300
-"""Added to a square before a division: changes nothing but zero."""
-
+RIGID_TOLERANCE = 1e-6  # Of R^T R from the identity: a matrix typed with six decimals
+TINY = 1e-300  # Added to a square before a division: changes nothing but zero
 IDENTITY = np.eye(3)
 
 _SO3_GENERATORS = np.array(
@@ -75,10 +68,7 @@ def log_so3(R: FloatArray) -> FloatArray:
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:
-    """Return unit quaternions of rotation matrices (S. W. Shepperd, 1978: divide by the largest component).
-
-    Rotation matrices, (..., 3, 3), to Hamilton quaternions x, y, z, w with w >= 0, (..., 4).
-    """
+    """Return Hamilton quaternions x, y, z, w with w >= 0, (..., 4), of rotations, (..., 3, 3) (S. W. Shepperd, 1978)."""
     R = np.asarray(R, dtype=np.float64)
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
@@ -153,8 +143,8 @@ def transform_points(T: FloatArray, points: FloatArray) -> FloatArray:
 def check_transform(T: ArrayLike) -> None:
     """Check that a matrix is one rigid transform.
 
-    Raises GeometryError: shape other than (4, 4), not finite, last row other than 0 0 0 1, not orthonormal to
-    :data:`RIGID_TOLERANCE`, or a reflection.
+    Raises GeometryError: not (4, 4), not finite, last row other than 0 0 0 1, not orthonormal to :data:`RIGID_TOLERANCE`, or
+    a reflection.
     """
     matrix = np.asarray(T, dtype=np.float64)
     if matrix.shape != (4, 4):
@@ -234,10 +224,7 @@ def exp_and_right_jacobian(w: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def inverse_right_jacobian(w: FloatArray) -> FloatArray:
-    """Inverse right Jacobian, (..., 3, 3), of rotation vectors below pi (Barfoot 7.1).
-
-    ``Log(R Exp(d)) = Log(R) + J_r^-1(Log R) d`` to first order in d.
-    """
+    """Inverse right Jacobian, (..., 3, 3), of vectors below pi (Barfoot 7.1): ``Log(R Exp(d)) = Log(R) + J_r^-1(Log R) d``."""
     square = dot(w, w)[..., None, None] + TINY
     half = 0.5 * np.sqrt(square)
     skew_w = skew(w)

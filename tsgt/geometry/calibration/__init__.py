@@ -1,8 +1,7 @@
 """Calibration of station frames, latencies and prism positions. Sans-I/O.
 
-In: points with covariances known in two frames (``targets``, ``frame_fit``), or the polar measurements of a moving robot
-(``motion*``, ``observability``, ``timestamp_drift``). Out: rigid transforms, latencies and prism positions, each with a
-covariance, rejected points, and the directions that the data leave unobservable.
+In: points with covariances in two frames, or polar measurements of a moving robot. Out: rigid transforms, latencies and
+prism positions with covariances, rejected points, and the directions that the data leave unobservable.
 """
 
 from tsgt.geometry.calibration.frame_fit import FrameFit, PointName, PointPairs, PointSet, fit_frame

@@ -116,23 +116,12 @@ class FrameFit:
 
 
 def fit_frame(pairs: PointPairs, *, weighted: bool) -> FrameFit:
-    """Fit a rigid transform by Gauss-Newton, initialised with Arun's solution.
+    """Fit a rigid transform to three or more points by Gauss-Newton, initialised with Arun's solution.
 
+    No residual covariance may be singular; their inverses, at Arun's rotation, are the weights (``weighted`` False: Arun's
+    unweighted least squares). The covariance of the result is of first order in the noise. The steps fail to converge only
+    where the points are collinear up to their noise; Arun's solution is returned then, with a covariance that shows it.
     Raises DegenerateGeometryError: too few points, or they coincide or are collinear (levelled: above one another).
-
-    Parameters
-    ----------
-    pairs
-        At least three points, no residual covariance singular.
-    weighted
-        Weight each residual with its inverse covariance; False is Arun's unweighted least squares.
-
-    Returns with a covariance of first order in the noise.
-
-    Notes
-    -----
-    The weights are computed once, at Arun's rotation. The steps fail to converge only where the points are collinear up
-    to their noise; Arun's solution is returned then, with a covariance that shows it.
     """
     initial = _initial_fit(pairs)
     noise = initial.residual_covariances_m2(pairs)

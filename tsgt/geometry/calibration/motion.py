@@ -1,10 +1,8 @@
 """Calibration of station frames, latencies and prism positions from the motion of a robot that all stations track. Sans-I/O.
 
-A wrong frame or latency distorts the rigid robot as it moves, so that the measurement factors of the trajectory
-(:mod:`tsgt.geometry.trajectory`) also determine the set-up. Each step solves the trajectory for a fixed set-up, then
-eliminates it from the joint normal equations (Schur complement through its banded factor); the small remaining system
-is solved for the set-up, and its inverse is the covariance with the trajectory marginalised.
-docs/how-to/calibrate-from-motion.md says what the result is good for.
+A wrong set-up distorts the rigid robot as it moves. Each step solves the trajectory for a fixed set-up, eliminates it from
+the joint normal equations (Schur complement through its banded factor) and solves the small remaining system, whose inverse
+is the covariance with the trajectory marginalised. See docs/how-to/calibrate-from-motion.md.
 """
 
 from __future__ import annotations
@@ -35,25 +33,12 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory import Observations, Solution, States
 
-SEGMENT_S = 40.0
-"""A recording is split into trajectories of this length: memory stays bounded, and inconsistent segments show. Little
-information is lost at their ends.
-"""
-
-MAX_GAP_S = 5.0
-"""A longer gap of all stations ends a segment: the motion is uncorrelated beyond, and a trajectory without measurements
-may not converge.
-"""
-
-MIN_MEASUREMENTS = 30
-"""Segments with fewer are skipped."""
-
+SEGMENT_S = 40.0  # Length of a trajectory: bounds memory, and shows inconsistent segments
+MAX_GAP_S = 5.0  # Of all stations; ends a segment, since a longer gap may prevent convergence
+MIN_MEASUREMENTS = 30  # Segments with fewer are skipped
 MAX_ITERATIONS = 30
-STEP_TOLERANCE = 1e-3
-"""The search converges when the squared length of a step, in sigmas of the set-up, is shorter."""
-
-COARSE_NOISE_SCALES = (20.0, 4.0)
-"""Noise scales of the first searches, so that a wrong set-up does not make every measurement an outlier."""
+STEP_TOLERANCE = 1e-3  # Squared length of a step, in sigmas of the set-up
+COARSE_NOISE_SCALES = (20.0, 4.0)  # First, so that a wrong set-up makes few outliers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,16 +108,11 @@ def calibrate_motion(
 
     Parameters
     ----------
-    observations
-        Polar measurements in the order of time, with the current set-up and the stated noise.
-    prior_sigmas
-        What to estimate, and its prior.
-    start
-        Initial set-up, about which the prior holds; that of the observations when not given.
-    prior, noise_scale
-        Tuned on the measurements when not given.
-    on_progress
-        Called with the name of each stage.
+    observations : Polar measurements in the order of time, with the current set-up and the stated noise.
+    prior_sigmas : What to estimate, and its prior.
+    start : Initial set-up, about which the prior holds; that of the observations when not given.
+    prior, noise_scale : Tuned on the measurements when not given.
+    on_progress : Called with the name of each stage.
     """
     initial = setup = Setup.of(observations) if start is None else start
     parameters = SetupParameters.of(setup.applied(observations), setup, prior_sigmas)

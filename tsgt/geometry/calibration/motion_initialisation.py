@@ -22,15 +22,10 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory import Observations
 
 STEP_S = 0.5
-MAX_GAP_S = 1.0
-"""Epochs between measurements of a station that are further apart are skipped."""
-
+MAX_GAP_S = 1.0  # Epochs between measurements of a station that are further apart are skipped
 MIN_EPOCHS = 20
-MIN_EXTENT_M = 2.0
-"""Smallest root mean square distance of the robot from the centroid of its path: a few times its own size."""
-
-LOSS_M = 0.05
-"""Scale of the robust loss: linear interpolation, timestamp errors and wrong prisms cause larger residuals."""
+MIN_EXTENT_M = 2.0  # RMS distance of the robot from its path's centroid: a few times its size
+LOSS_M = 0.05  # Robust loss: interpolation, timestamp errors and wrong prisms exceed it
 
 
 class _Track(NamedTuple):
@@ -42,11 +37,10 @@ class _Track(NamedTuple):
 
 
 def frames_from_motion(observations: Observations) -> FloatArray:
-    """Return initial frames, (S, 4, 4), of stations that are approximately level.
+    """Return initial frames, (S, 4, 4), of approximately level stations, from polar measurements in the order of time.
 
-    From polar measurements in the order of time; of their frames only that of station 1 (row 0) is used.
-
-    Raises GeometryError: two stations have too few epochs in common, or the robot hardly moved.
+    Of their frames only that of station 1 (row 0) is used. Raises GeometryError: two stations have too few epochs in common,
+    or the robot hardly moved.
     """
     stations = np.unique(observations.station)
     if 0 not in stations:

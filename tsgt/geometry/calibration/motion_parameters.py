@@ -53,10 +53,7 @@ class Setup:
         return updated.select(np.argsort(time_s, kind="stable"))
 
     def corrections(self, reference: Setup, pivot: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Corrections of each station's frame from a reference.
-
-        Returns the translation at the pivot in m and the rotation in rad, (S, 3) each.
-        """
+        """Corrections of each station's frame from a reference: translation at the pivot in m, rotation in rad, (S, 3) each."""
         station_from_reference = np.swapaxes(reference.frames[:, :3, :3], 1, 2)
         pivot_in_station = rotate(station_from_reference, pivot - reference.frames[:, :3, 3])
         translation = rotate(self.frames[:, :3, :3], pivot_in_station) + self.frames[:, :3, 3] - pivot

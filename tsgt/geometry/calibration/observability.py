@@ -20,8 +20,7 @@ LATENCY_LIMIT_S = 0.005
 PRISM_LIMIT_M = 0.005
 """One-sigma limits beyond which a parameter counts as unobservable; the limit is half the prior's sigma if that is smaller."""
 
-MIN_COMPONENT_SHARE = 0.2
-"""Components of a direction below this share of its largest are omitted from the description."""
+MIN_COMPONENT_SHARE = 0.2  # Of a direction's largest; smaller components are not described
 
 
 @dataclass(frozen=True, slots=True)

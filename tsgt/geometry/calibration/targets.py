@@ -1,9 +1,7 @@
 """Frames from points measured in two of them: stations from targets, prisms from body points. Sans-I/O.
 
-The frame follows from the alignment of the points (paper section III-C, "Calibration procedure": Arun et al. 1987), by
-default weighted by the noise of both measurements. Each point is predicted from all others: data snooping (Baarda 1968,
-here with three coordinates at a time) rejects outliers. The covariance shows about which axes the points hold the frame
-weakly.
+The points are aligned (paper section III-C, "Calibration procedure": Arun et al. 1987), by default weighted by the noise of
+both. Each is predicted from all others: data snooping (Baarda 1968, three coordinates at a time) rejects outliers.
 """
 
 from __future__ import annotations
@@ -22,9 +20,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.calibration.frame_fit import PointName
     from tsgt.geometry.rigid import FloatArray
 
-FALSE_ALARM_RATE = 1e-4
-"""Probability of suspecting any point of a set that matches its noise model."""
-
+FALSE_ALARM_RATE = 1e-4  # Probability of suspecting any point of a set that matches its noise model
 MAX_NOISE_SCALE = 2.0
 """Factor on the noise model's sigmas beyond which points are inconsistent.
 
@@ -135,13 +131,11 @@ def calibrate_frame(
 
     Parameters
     ----------
-    source, target
-        Paired by name; unpaired points are ignored. No covariance of the source may be singular.
+    source, target : Paired by name; unpaired points are ignored. No covariance of the source may be singular.
     weighted
         Weight each residual with its inverse covariance (maximum likelihood); False is Arun's unweighted least squares.
         Outlier tests follow the noise model either way.
-    levelled
-        Both z axes are vertical: only heading and position are solved.
+    levelled : Both z axes are vertical: only heading and position are solved.
     """
     common = [name for name in target.names if name in source.names]
     if len(common) < MIN_POINTS:
@@ -177,12 +171,10 @@ def calibrate_frame(
 
 
 def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> PrismCalibration:
-    """Find the prisms in the robot frame from one station's measurements of them and of body points.
+    """Find the prisms in the robot frame from one station's measurements of them and of body points, in its frame.
 
-    ``body`` and ``prisms`` are measured from the same place, in the station's frame; ``body_cad`` has the body points
-    in the robot frame, from CAD, with the build tolerance as covariance.
-
-    Raises DegenerateGeometryError: fewer than three body points, or they coincide or are collinear.
+    ``body_cad`` has the body points in the robot frame, from CAD, with the build tolerance as covariance. Raises
+    DegenerateGeometryError: fewer than three body points, or they coincide or are collinear.
     """
     frame = calibrate_frame(body, body_cad, limits=BODY_LIMITS)
     rotation = frame.T[:3, :3]
@@ -255,12 +247,7 @@ def _worst_outlier(pairs: PointPairs, blunder_m: float) -> PointName | None:
 
 
 def _outliers(pairs: PointPairs, blunder_m: float) -> tuple[PointName, ...] | None:
-    """Outliers, found one at a time; None where they cannot be identified.
-
-    That is the case if rejecting another point instead would make the rest plausible as well, if fewer than four points
-    would remain, if the outliers come near to half of all, or if the rest are inconsistent with their noise although
-    none stands out.
-    """
+    """Outliers, found one at a time; None if ambiguous, near half of all, under four remain, or the rest is inconsistent."""
     outliers: list[PointName] = []
     kept = pairs
     max_outliers = (len(pairs.names) - MIN_POINTS) // 2

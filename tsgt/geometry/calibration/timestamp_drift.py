@@ -1,9 +1,8 @@
 """Timestamp drift (wander) as a random effect in a calibration from motion. Sans-I/O.
 
-A station's clock is known to a millisecond or so, and the error changes over minutes: it does not average out, and a
-trajectory with another time offset in each segment of a recording looks like rotated frames. Each station therefore gets an
-additional latency in each segment, all with one variance (a random effect), which restricted maximum likelihood estimates
-(D. A. Harville, Journal of the American Statistical Association 72, 1977).
+Clock errors change over minutes and look like rotated frames. Each station gets an additional latency in each segment, all
+with one variance, which restricted maximum likelihood estimates (D. A. Harville, Journal of the American Statistical
+Association 72, 1977).
 """
 
 from __future__ import annotations
@@ -21,8 +20,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
 MIN_WANDER_S = 1e-5
-MAX_WANDER_S = 0.1
-"""Bounds of the search: less is invisible with any instrument, more is no wander."""
+MAX_WANDER_S = 0.1  # Bounds of the search: less is invisible with any instrument, more is no wander
 
 
 class SegmentInformation(NamedTuple):

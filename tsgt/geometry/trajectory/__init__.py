@@ -1,8 +1,6 @@
 """The continuous-time estimator: Gaussian-process regression of a trajectory on polar measurements. Sans-I/O.
 
-In: :class:`Observations` (measurements with noise, station frames, prism layout) and a motion prior. Out: a
-:class:`Trajectory`, which interpolates states and covariances at any time. :func:`fit_trajectory` solves a whole recording,
-:class:`FixedLagSmoother` works online, :func:`tune` finds the hyperparameters.
+:func:`fit_trajectory` solves a whole recording, :class:`FixedLagSmoother` works online, :func:`tune` finds hyperparameters.
 docs/explanation/continuous-trajectory.md derives the equations.
 """
 

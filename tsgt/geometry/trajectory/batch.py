@@ -33,11 +33,8 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
-KNOTS_PER_SEGMENT = 1024
-"""About two minutes of 3 stations at 2.5 Hz: their blocks fit into the cache."""
-
-OVERLAP_KNOTS = 128
-"""Knots on either side of a segment that are solved with it and discarded."""
+KNOTS_PER_SEGMENT = 1024  # About two minutes of 3 stations at 2.5 Hz: their blocks fit into the cache
+OVERLAP_KNOTS = 128  # Knots on either side of a segment that are solved with it and discarded
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,16 +76,11 @@ def fit_trajectory(
 
     Parameters
     ----------
-    observations
-        In the order of time, with the stated noise of the instruments.
-    prior
-        Tuned on the measurements when not given.
-    occluded_prior
-        Process-noise floor while fewer than three prisms are observed; ``prior`` when only that is given.
-    noise_scale
-        Factor on the stated noise; tuned on the measurements when not given.
-    on_progress
-        Called with the completed share of the work, 0 to 1.
+    observations : In the order of time, with the stated noise of the instruments.
+    prior : Tuned on the measurements when not given.
+    occluded_prior : Process-noise floor while fewer than three prisms are observed; ``prior`` when only that is given.
+    noise_scale : Factor on the stated noise; tuned on the measurements when not given.
+    on_progress : Called with the completed share of the work, 0 to 1.
     """
     report_progress = on_progress or (lambda _: None)
     if prior is None or noise_scale is None:

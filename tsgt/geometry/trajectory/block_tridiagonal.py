@@ -18,8 +18,7 @@ from tsgt.errors import GeometryError
 if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
-_BLOCKS_PER_CHUNK = 64
-"""Chunk that stays in the L1 cache: twice as fast as all blocks in one pass."""
+_BLOCKS_PER_CHUNK = 64  # Chunk that stays in the L1 cache: twice as fast as all blocks in one pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +78,10 @@ def _inverse_and_sub_diagonal(columns: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
-    """Factorise a block-tridiagonal matrix.
+    """Factorise a block-tridiagonal matrix. Raises GeometryError: it is not positive definite.
 
-    ``diagonal``, (K, B, B), are the symmetric blocks on the diagonal, of which only the lower triangles are read;
-    ``off_diagonal``, (K - 1, B, B), those right of it: row block k, column block k + 1.
-
-    Raises GeometryError: the matrix is not positive definite.
+    ``diagonal``, (K, B, B): symmetric, only the lower triangles are read; ``off_diagonal``, (K - 1, B, B): row block k,
+    column block k + 1.
     """
     count, size, _ = diagonal.shape
     # LAPACK's band storage is column by column.

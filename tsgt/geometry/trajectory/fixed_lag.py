@@ -1,11 +1,8 @@
 """Fixed-lag smoother: the estimator ``continuous`` online, in a window of knots that moves with time. Sans-I/O.
 
-The window holds the knots of the last few seconds. Older knots are marginalised (Schur complement) into an anchor prior on
-the oldest knot of the window, so that the cost per measurement stays constant. Within the window a measurement counts
-whenever it arrives, and all measurements are relinearised. docs/explanation/continuous-trajectory.md says more.
-
-The initial weight of a new measurement follows from its normalised innovation squared (NIS; Bar-Shalom), which includes the
-uncertainty of the prediction: a large residual may also be a manoeuvre.
+Knots older than a few seconds are marginalised (Schur complement) into an anchor prior on the oldest knot of the window. A
+new measurement's initial weight follows from its normalised innovation squared (NIS; Bar-Shalom), with the prediction's
+uncertainty: a large residual may also be a manoeuvre. See docs/explanation/continuous-trajectory.md.
 """
 
 from __future__ import annotations
@@ -47,9 +44,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.model import MotionPrior
 
-CONVERGED_SIGMA_RAD = 0.1
-"""Rotation sigma below which an initialised trajectory is tracked from measurement to measurement."""
-
+CONVERGED_SIGMA_RAD = 0.1  # Below, an initialised trajectory is tracked
 LOST_SIGMA_RAD = 0.2
 """Rotation sigma above which the trajectory is reinitialised. The rotation that two prisms leave unobserved is about another
 axis for each attitude: tracking beyond the range of the linearisation would create information from nothing.
@@ -73,25 +68,15 @@ STEP_TOLERANCE_RAD = 0.005
 robot rotating at 1 rad/s were up to 0.4 sigmas from those of a full search.
 """
 
-MAX_INITIAL_ITERATIONS = 10
-"""Initialisations that converge take six at most; others (a station on another robot) are retried with each measurement."""
-
-MIN_MEASUREMENTS_PER_PRISM, MAX_GAP_S = 3, 1.25
-"""Measurements of each prism, and the longest gap between them, that determine the trajectory without any earlier ones."""
-
-PREDICTION_NOISE_SCALE = 2.0
-"""Process-noise scale of predictions beyond the last measurement. Driving is not Gaussian: minutes of steady motion, then a
-sudden manoeuvre.
-"""
-
+MAX_INITIAL_ITERATIONS = 10  # Six at most if it converges; others are retried
+MIN_MEASUREMENTS_PER_PRISM, MAX_GAP_S = 3, 1.25  # Determine the trajectory without earlier ones
+PREDICTION_NOISE_SCALE = 2.0  # After minutes of steady motion a sudden manoeuvre may come
 PREDICTION_NIS_THRESHOLD = 4.0
 """NIS of the newest measurement above which the covariance of predictions is scaled up in proportion: a manoeuvre that has
 begun goes on. A robot that moves as the prior says exceeds it once in four times.
 """
 
-MAX_STEPS = 5
-"""Steps without line search; then :func:`tsgt.geometry.trajectory.gauss_newton.solve` takes over."""
-
+MAX_STEPS = 5  # Without line search; then ``gauss_newton.solve`` takes over
 _DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0, 10.0, 10.0, 10.0], 3)
 """Sigmas of the first state's error (m, rad, and their first and second time derivatives) once measurements determine it to
 millimetres. Larger ones would be lost to rounding against the stiff process factors when it is eliminated.
@@ -99,15 +84,10 @@ millimetres. Larger ones would be lost to rounding against the stiff process fac
 
 
 class FixedLagSmoother:
-    """Estimates the trajectory of a robot online.
+    """Estimates the trajectory of a robot online, from ``observations``: those of the window in the order of time, or None.
 
-    Attributes
-    ----------
-    observations
-        The measurements of the window, in the order of time; None before the first one.
-    residuals_m
-        (M, 3) their residuals as in :class:`~tsgt.geometry.trajectory.measurement_factors.LinearisedMeasurements`; NaN
-        without a trajectory.
+    ``residuals_m``: (M, 3) as in :class:`~tsgt.geometry.trajectory.measurement_factors.LinearisedMeasurements`; NaN without
+    a trajectory.
     """
 
     def __init__(self, prior: MotionPrior) -> None:
@@ -145,10 +125,9 @@ class FixedLagSmoother:
     def reliable_from_s(self) -> float:
         """Time from which the trajectory since the last initialisation is reliable, infinite before the first one.
 
-        It is the time at which each of three prisms has been measured a second time. After one or two measurements of
-        each, the robot may lie the other way about the line through two prisms; later measurements resolve that for
-        later times, not for times before a gap. And the first measurement of a prism, with nothing before it to
-        contradict it, may be of a wrong prism.
+        Each of three prisms must have been measured twice: after one or two measurements of each, the robot may lie the
+        other way about the line through two prisms, which later measurements do not resolve for times before a gap; and the
+        first measurement, with nothing to contradict it, may be of a wrong prism.
         """
         return self._reliable_from_s
 
@@ -227,8 +206,8 @@ class FixedLagSmoother:
     def predict(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all measurements so far, with its covariance as :meth:`Trajectory.at` does.
 
-        Beyond the last measurement the process noise is scaled by :data:`PREDICTION_NOISE_SCALE`, and the covariance by
-        the newest NIS.
+        Beyond the last measurement :data:`PREDICTION_NOISE_SCALE` scales the process noise and the newest NIS the
+        covariance.
         """
         assert self._propagator is not None  # noqa: S101 (only called while initialised)
         if time_s >= self._propagator.time_s:
@@ -353,10 +332,7 @@ def _determined_from_s(observations: Observations) -> float:
 def _innovations(
     system: NormalEquations, knot_index: NDArray[np.intp], is_new: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
-    """Normalised innovations squared (NIS) of new measurements, inactive in ``system``.
-
-    Returns each one's own NIS, and its NIS conditioned on those before it that are inliers.
-    """
+    """NIS of new measurements, inactive in ``system``: each one's own, and conditioned on those before it that are inliers."""
     whitened = system.whitened[is_new]
     rhs = np.zeros((*system.gradient.shape, 3 * len(is_new) + 1))
     rhs[:, :, -1] = -system.gradient

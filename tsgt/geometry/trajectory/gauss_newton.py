@@ -1,12 +1,9 @@
 """Maximum a posteriori trajectory by Gauss-Newton on states at knots; the solver of the estimator ``continuous``. Sans-I/O.
 
-Prior: :mod:`~tsgt.geometry.trajectory.motion_prior`. Likelihood: range and angles of each measurement
-(:mod:`~tsgt.geometry.trajectory.measurement_factors`) with a robust loss by iterative reweighting (IRLS). Each step solves
-one block-tridiagonal system (:mod:`~tsgt.geometry.trajectory.block_tridiagonal`), whose inverse's blocks are the
-covariances, with backtracking along the step. After S. Anderson and T. D. Barfoot, "Full STEAM ahead: exactly sparse
-Gaussian process regression for batch continuous-time trajectory estimation on SE(3)", IROS 2015, with the position in frame
-``station1`` and the rotation in the robot frame, each with its own prior.
-docs/explanation/continuous-trajectory.md derives it.
+The loss is robust by iterative reweighting (IRLS); each step solves one block-tridiagonal system, with backtracking. After
+S. Anderson and T. D. Barfoot, "Full STEAM ahead: exactly sparse Gaussian process regression for batch continuous-time
+trajectory estimation on SE(3)", IROS 2015, with position in ``station1`` and rotation in the robot frame, each with its own
+prior. docs/explanation/continuous-trajectory.md derives it.
 """
 
 from __future__ import annotations
@@ -38,9 +35,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
     from tsgt.model import MotionPrior
 
-MIN_KNOT_SPACING_S = 0.02
-"""Within half of this the motion is described by velocity and acceleration."""
-
+MIN_KNOT_SPACING_S = 0.02  # Within half of this the motion is described by velocity and acceleration
 OUTLIER_THRESHOLD = 4.0
 """Mahalanobis distance (3 degrees of freedom) beyond which a measurement is an outlier: its weight falls with the
 distance. 0.11 % of good measurements exceed it (chi-square of 16).
@@ -54,23 +49,16 @@ measurements of a station on a wrong prism, 500 sigmas off, rotated a robot by 0
 INITIAL_VELOCITY_SIGMA_MPS = 10.0
 INITIAL_ANGULAR_VELOCITY_SIGMA_RADPS = 10.0
 INITIAL_POSITION_SIGMA_M = 1e4
-INITIAL_ROTATION_SIGMA_RAD = 1e2
-"""Diffuse prior on the first knot."""
-
+INITIAL_ROTATION_SIGMA_RAD = 1e2  # Diffuse prior on the first knot
 MAX_ITERATIONS = 30
-COST_TOLERANCE = 1e-3
-"""The search converges when a step reduces the cost (minus twice a log density) by less."""
-
+COST_TOLERANCE = 1e-3  # The search converges when a step reduces the cost (minus twice a log density) by less
 PREDICTED_GAIN_TOLERANCE = 1e-2
 """A step with a smaller predicted gain is the last one, without relinearisation: it moves the states by at most a tenth of a
 sigma, and the derivatives by far less than the rounding of the result.
 """
 
-_MEASUREMENTS_PER_CHUNK, _FACTORS_PER_CHUNK = 128, 256
-"""Chunks that stay in the L1 cache until they are added up: twice as fast as one pass."""
-
-MIN_STEP_FRACTION = 1e-3
-"""Smallest fraction of a step that the line search tries."""
+_MEASUREMENTS_PER_CHUNK, _FACTORS_PER_CHUNK = 128, 256  # Stay in the L1 cache: twice as fast
+MIN_STEP_FRACTION = 1e-3  # Smallest fraction of a step that the line search tries
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,23 +146,12 @@ def solve(
     max_iterations: int = MAX_ITERATIONS,
     reject_outliers: bool = True,
 ) -> Solution:
-    """Find the maximum a posteriori trajectory.
+    """Find the maximum a posteriori trajectory from observations in any order.
 
-    Raises GeometryError: the measurements do not determine the trajectory.
-
-    Parameters
-    ----------
-    observations
-        In any order.
-    guess
-        Initial states at the knot times of the result; rotations within about a radian of the solution.
-    anchor
-        Prior on the first knot; diffuse when not given.
-    sigmas
-        (K - 1, 6) acceleration sigmas of each step; those of ``prior`` when not given.
-    reject_outliers
-        Solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`. Without, the solution is a smooth
-        function of its inputs.
+    ``guess``: states at the knot times of the result; rotations within about a radian of the solution. ``anchor``: prior on
+    the first knot; diffuse when not given. ``sigmas``: (K - 1, 6) acceleration sigmas of each step instead of those of
+    ``prior``. ``reject_outliers``: solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`; without, the
+    solution is a smooth function of its inputs. Raises GeometryError: the measurements do not determine the trajectory.
     """
     anchor = diffuse_prior(guess.select(slice(0, 1)), prior) if anchor is None else anchor
     knot_index = nearest_knots(guess.time_s, observations.time_s)
@@ -226,11 +203,7 @@ def _minimise(
 def _line_search(
     evaluate: Callable[[States], NormalEquations], knots: States, step: FloatArray, system: NormalEquations
 ) -> tuple[NormalEquations | None, States]:
-    """Backtrack along a step until the cost decreases sufficiently; None where rounding hides any decrease.
-
-    Backtracking suits the stiff chain of knots better than Levenberg-Marquardt damping: that would hold back all knots
-    for the sake of one that rotated too far.
-    """
+    """Backtrack along a step until the cost decreases sufficiently; None where rounding hides any decrease."""
     predicted_decrease = -float(np.vdot(step, system.gradient))
     fraction = 1.0
     while fraction > MIN_STEP_FRACTION:
@@ -333,10 +306,7 @@ def add_measurements(
 def apply_linear_step(
     system: NormalEquations, knot_index: NDArray[np.intp], step: FloatArray
 ) -> NormalEquations:
-    """Apply a small step to residuals, weights and cost without relinearising.
-
-    Jacobians and predicted prism states stay those before the step.
-    """
+    """Apply a small step to residuals, weights and cost; Jacobians and predicted prism states stay those before the step."""
     steps = step[knot_index][:, :, None]
     linearised = system.linearised
     residuals_m = linearised.residuals_m + (linearised.jacobian @ steps)[:, :, 0]

@@ -1,14 +1,8 @@
 """Hyperparameters of the estimator: motion prior, noise scale, and a floor for the process noise. Sans-I/O.
 
-:func:`tune` maximises the evidence (type-II maximum likelihood), the density of the measurements with the trajectory
-integrated out. The gradient is that of the expected complete-data log likelihood (Fisher's identity), from the marginal
-covariances that the solution has anyway; exact for the linearised problem.
-
-:func:`with_noise_floor` bounds the process noise of a tuned prior from below. Driving is not Gaussian: a prior tuned to
-minutes of straight driving makes the next bend impossible. While all prisms are measured the data overrule it, during an
-outage they do not.
-
-docs/explanation/continuous-trajectory.md has the formulas and the measured effects.
+:func:`tune` maximises the evidence (type-II maximum likelihood); its gradient is that of the expected complete-data log
+likelihood (Fisher's identity). :func:`with_noise_floor` bounds the process noise of a tuned prior: one tuned to minutes of
+straight driving makes the next bend impossible. See docs/explanation/continuous-trajectory.md.
 """
 
 from __future__ import annotations
@@ -43,15 +37,9 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory.states import States
 
 SEGMENT_S = 40.0
-SEGMENTS = 4
-"""Evenly spread segments that represent a long recording."""
-
-MIN_MEASUREMENTS = 30
-"""Per segment."""
-
-_SIGMA_PARAMETERS = np.array([0, 0, 1, 3, 3, 4])
-"""Parameter of each axis's sigma: x and y share one, and so do roll and pitch (ground robot)."""
-
+SEGMENTS = 4  # Evenly spread segments that represent a long recording
+MIN_MEASUREMENTS = 30  # Per segment
+_SIGMA_PARAMETERS = np.array([0, 0, 1, 3, 3, 4])  # By axis; x and y share one, roll and pitch too
 _TIME_PARAMETERS = (2, 5)
 _SCALE_PARAMETER = 6
 _LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03, 0.5])
@@ -98,16 +86,11 @@ def tune(
 
     Parameters
     ----------
-    observations
-        In the order of time, with the stated noise.
-    start
-        Initial prior; hardly affects the result.
-    noise_scale
-        Kept at this value; estimated as well when not given.
-    noise_only
-        Keep the prior and estimate only the noise scale.
-    on_progress
-        Called with the number of evaluations.
+    observations : In the order of time, with the stated noise.
+    start : Initial prior; hardly affects the result.
+    noise_scale : Kept at this value; estimated as well when not given.
+    noise_only : Keep the prior and estimate only the noise scale.
+    on_progress : Called with the number of evaluations.
     """
     initial = log_parameters(
         MotionPrior() if start is None else start, 1.0 if noise_scale is None else noise_scale
@@ -128,11 +111,7 @@ def maximise_evidence(
     *,
     on_progress: Callable[[int], None] | None = None,
 ) -> Hyperparameters:
-    """Maximise the evidence within bounds by L-BFGS-B.
-
-    ``start``, ``lower`` and ``upper``, (7,), are log parameters as from :func:`log_parameters`; the rest is as for
-    :func:`tune`.
-    """
+    """Maximise the evidence by L-BFGS-B; bounds and start: log parameters, (7,), of :func:`log_parameters`; as :func:`tune`."""
     segments = _segments(observations)
     evaluations = 0
     # Per measurement: the first step of the search is then of order one, a factor of e in a parameter.
@@ -259,10 +238,7 @@ _Moments = tuple["FloatArray", "FloatArray", "FloatArray"]
 
 
 def _expected_moments(solution: Solution, covariance: FloatArray, cross_covariance: FloatArray) -> _Moments:
-    """Second moments of the states that each process factor connects, by axis, (K - 1, 6, 3, 3).
-
-    Of the later state, of later with earlier, and of the earlier state.
-    """
+    """(K - 1, 6, 3, 3) second moments by process factor and axis: of the later state, later with earlier, of the earlier."""
     linearised = linearise_process(solution.knots, solution.process)
     count = len(cross_covariance)
     earlier, later = linearised.earlier, linearised.later
@@ -318,16 +294,11 @@ def _expected_log_density(moments: _Moments, dt_s: FloatArray, time_s: float, si
     return -0.5 * float(squared_distances.sum()) + 0.5 * len(sigmas) * float(logdet.sum())
 
 
-NOISE_FLOOR_SHARE = 1.0 / 3.0
-"""Lower bound of a tuned prior's process noise, relative to the configured prior."""
-
-OUTAGE_S = 2.0
-"""Longest gap between measurements of a prism that counts as observed."""
-
+NOISE_FLOOR_SHARE = 1.0 / 3.0  # Of the configured prior's process noise
+OUTAGE_S = 2.0  # Longest gap between measurements of a prism that counts as observed
 _MIN_PRISMS = 3
 
-_MANOEUVRE_RADPS = 1.0
-"""Angular frequency of manoeuvres: accelerating and braking, or turning there and back, takes about six seconds."""
+_MANOEUVRE_RADPS = 1.0  # Accelerating and braking, or turning there and back: six seconds
 
 
 def with_noise_floor(prior: MotionPrior, floor: MotionPrior, share: float = 1.0) -> MotionPrior:
@@ -354,8 +325,7 @@ def _relative_power(time_s: FloatArray) -> FloatArray:
 def partially_occluded(time_s: FloatArray, prism: NDArray[np.intp], at_s: FloatArray) -> NDArray[np.bool_]:
     """Whether fewer than three prisms are observed at times ``at_s``, (N,).
 
-    A prism is observed while its measurements (M times in increasing order, M prisms) before and after are at most
-    :data:`OUTAGE_S` apart.
+    That is while their measurements (M increasing times, M prisms) before and after are at most :data:`OUTAGE_S` apart.
     """
     observed = np.zeros(len(at_s), np.intp)
     for each in np.unique(prism):

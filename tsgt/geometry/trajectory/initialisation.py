@@ -18,14 +18,11 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
-_MAX_GAP_FACTOR = 3.0
-"""Longest gap of a track that counts as tracked, relative to the median interval."""
+_MAX_GAP_FACTOR = 3.0  # Longest gap of a track that counts as tracked, relative to the median interval
 
 
 def initial_guess(observations: Observations, time_s: FloatArray) -> States:
-    """Return initial states at knot times, (K,).
-
-    Poses from linear interpolation between measurements, velocities from their differences.
+    """Return initial states at knot times, (K,): poses from linear interpolation, velocities from their differences.
 
     Raises GeometryError: fewer than three prisms were measured, or their tracks coincide or are collinear everywhere.
     """

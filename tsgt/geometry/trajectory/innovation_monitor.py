@@ -16,18 +16,11 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
-AMBIGUITY_MARGIN_S = 1.5
-"""Part of an ambiguous interval before its first inconsistent measurement: a few measurements of each prism."""
+AMBIGUITY_MARGIN_S = 1.5  # Before the first inconsistent measurement: a few of each prism
 
 
 class InnovationMonitor:
-    """Tracks inconsistent innovations of the window and the intervals in which the state is ambiguous.
-
-    Attributes
-    ----------
-    inconsistent_prisms
-        Prisms whose newest measurement is inconsistent. While there are any, the state is ambiguous.
-    """
+    """Tracks innovations: the state is ambiguous while the newest of a prism is inconsistent (``inconsistent_prisms``)."""
 
     def __init__(self) -> None:
         self.inconsistent_prisms: frozenset[int] = frozenset()
@@ -43,8 +36,8 @@ class InnovationMonitor:
     def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """Whether the state stays ambiguous at times (N,), by the resolved ambiguities.
 
-        A resolved ambiguity leaves no interval if all flagged measurements are of one prism and still outliers: then
-        these were wrong. Otherwise the trajectory followed the wrong ones, or was bent towards all of them.
+        None remains if all flagged measurements are of one prism and still outliers: then these were wrong. Otherwise the
+        trajectory followed the wrong ones, or was bent towards all of them.
         """
         found = np.zeros(len(time_s), np.bool_)
         for from_s, until_s in self._ambiguous_intervals_s:
@@ -75,9 +68,8 @@ class InnovationMonitor:
         inconsistent: NDArray[np.bool_],
         outliers: NDArray[np.bool_],
     ) -> None:
-        """Process new measurements.
+        """Process the N new of the window's M measurements (``is_new``); ``outliers``, (M,), are of the updated trajectory.
 
-        Of the window's M measurements ``is_new`` marks the N new ones and ``outliers`` those of the updated trajectory;
         ``inconsistent``, (N,), are the new ones whose innovation failed the gate.
         """
         flagged = np.zeros(len(observations), np.bool_)

@@ -71,10 +71,7 @@ class LinearisedMeasurements:
         return covariance
 
     def whitened(self, observations: Observations) -> FloatArray:
-        """Whitened Jacobians and residuals, (M, 3, 19), the residuals last.
-
-        The covariance is diagonal plus rank one; its inverse square root has a closed form.
-        """
+        """Whitened Jacobians and residuals, (M, 3, 19), the residuals last: the covariance is diagonal plus rank one."""
         sigmas_m = observations.sigmas_m
         by_time = matvec(self.by_point, self.velocity_mps) * (observations.time_sigma_s[:, None] / sigmas_m)
         root = np.sqrt(1.0 + dot(by_time, by_time))
@@ -149,10 +146,9 @@ def _residuals_by_point(observations: Observations, point: FloatArray) -> tuple[
 
 
 def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors along and across the lines of sight to points, (M, 3), and the distances, (M,).
+    """Return unit vectors of the lines of sight to points, (M, 3), as rows of (M, 3, 3), and the distances, (M,).
 
-    The rows of (M, 3, 3), in the station frame, are: along, across in the direction of growing horizontal angle, across in
-    that of growing zenith angle.
+    In the station frame: along, and across in the directions of growing horizontal angle and of growing zenith angle.
     """
     distance_m = np.sqrt(dot(points_m, points_m))
     # A corrected distance of zero has no direction: any unit vector avoids NaN.

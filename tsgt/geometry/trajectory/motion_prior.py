@@ -25,13 +25,11 @@ if TYPE_CHECKING:
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
-_DT_POWERS = np.array([2.0, 1.0, 0.0])
-"""Powers of dt that scale position, velocity and acceleration."""
+_DT_POWERS = np.array([2.0, 1.0, 0.0])  # Powers of dt that scale position, velocity and acceleration
 _WEIGHTED_NODES = np.sqrt(_WEIGHTS)[:, None] * _NODES[:, None] ** _DT_POWERS
 
 _SERIES_BELOW = 1e-2
-_QUADRATURE_BELOW = 2.0
-"""In correlation times: above this the closed form of Q loses no significant digits."""
+_QUADRATURE_BELOW = 2.0  # In correlation times: above this the closed form of Q loses no significant digits
 
 
 def axis_correlation_times_s(prior: MotionPrior) -> FloatArray:
@@ -59,10 +57,7 @@ def prior_from_axes(sigmas: Iterable[float], times_s: Iterable[float]) -> Motion
 
 
 def transition(dt_s: ArrayLike, time_s: ArrayLike) -> FloatArray:
-    """Transition matrices ``Phi(dt)`` of one axis, (..., 3, 3), for (position, velocity, acceleration).
-
-    Steps, not negative, and correlation times of the acceleration, in s, are broadcast.
-    """
+    """Transition matrices ``Phi(dt)``, (..., 3, 3), of one axis' (position, velocity, acceleration); dt >= 0, times in s."""
     dt_s = np.asarray(dt_s, np.float64)
     s = dt_s / np.asarray(time_s, np.float64)
     phi = np.zeros((*s.shape, 3, 3))
@@ -104,10 +99,7 @@ def interpolation_weights(
 
 
 def _impulse_response(s: FloatArray) -> FloatArray:
-    """(..., 3) position, velocity and acceleration a time s after a unit acceleration impulse, in units of that time.
-
-    They are (exp(-s) - 1 + s) / s^2, (1 - exp(-s)) / s and exp(-s); 1/2, 1 and 1 at 0.
-    """
+    """(exp(-s) - 1 + s) / s^2, (1 - exp(-s)) / s, exp(-s), (..., 3): position, velocity, acceleration; 1/2, 1, 1 at 0."""
     above_zero = np.maximum(s, TINY)
     decayed = -np.expm1(-above_zero)
     series = 0.5 - s / 6 * (1 - s / 4 * (1 - s / 5 * (1 - s / 6)))

@@ -19,11 +19,8 @@ if TYPE_CHECKING:
     from tsgt.model import MotionPrior
 
 _SMALL_ANGLE_RAD = 1e-2
-_SMALL_STEP = 1e-2
-"""In correlation times: below, a power series keeps the digits that the closed form loses."""
-
-_SERIES_BELOW = 2.0
-"""In correlation times: below, the process noise's power series with ``_TERMS`` terms is exact to 14 digits."""
+_SMALL_STEP = 1e-2  # In correlation times: below, a power series keeps the digits that the closed form loses
+_SERIES_BELOW = 2.0  # Correlation times; below, the series of _TERMS terms is exact to 14 digits
 _TERMS = 32
 _POWERS = np.arange(_TERMS, dtype=np.float64)
 
@@ -33,16 +30,9 @@ _Vector = tuple[float, float, float]
 
 
 class Propagator:
-    """Predicts a robot's motion from one state.
+    """Predicts a robot's motion from one state with the (18, 18) covariance of its error.
 
-    Parameters
-    ----------
-    start
-        One state.
-    covariance
-        (18, 18) of its error.
-    process_noise_scale
-        Factor on the variance of the prior's accelerations.
+    ``process_noise_scale`` is a factor on the variance of the prior's accelerations.
     """
 
     def __init__(
@@ -57,10 +47,7 @@ class Propagator:
         self._variances = process_noise_scale * axis_sigmas(prior) ** 2
 
     def at(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
-        """State at a time not before the start, and the (1, dim, dim) covariance of its leading error components.
-
-        Shapes as for one time of :meth:`~tsgt.geometry.trajectory.query.Trajectory.at`.
-        """
+        """State at a time not before the start, and the (1, dim, dim) covariance of its leading error components."""
         start, dt_s = self._start, time_s - self.time_s
         linear, angular = (acceleration_response(dt_s, float(each)) for each in self._times_s)
         magnus_s2 = dt_s * dt_s / 12
@@ -115,11 +102,7 @@ def acceleration_response(dt_s: float, time_s: float) -> _Vector:
 
 
 def _series() -> FloatArray:
-    """(32, 9) power series of the process noise in minus the step in correlation times, without the factor 2 s.
-
-    The response to an impulse is the exponential series from its second, first or zeroth term on; products of two responses
-    are integrated term by term.
-    """
+    """(32, 9) power series of the process noise in minus the step in correlation times, without the factor 2 s."""
     coefficients = np.zeros((_TERMS, 3, 3))
     for i in range(3):
         for j in range(3):

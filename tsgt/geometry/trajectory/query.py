@@ -38,9 +38,7 @@ from tsgt.geometry.trajectory.states import (
 if TYPE_CHECKING:
     from tsgt.model import MotionPrior
 
-_CHUNK = 512
-"""Times per pass; stays in the cache, a third faster than passes of 4096."""
-
+_CHUNK = 512  # Times per pass; stays in the cache, a third faster than passes of 4096
 _IDENTITY_18 = np.eye(STATE_DIM)[None]
 
 
@@ -56,10 +54,7 @@ class Trajectory:
     sigmas: FloatArray | None = None
 
     def at(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
-        """Return states at N times, in any order, and the (N, dim, dim) covariance of their leading error components.
-
-        ``dim`` is 18, or 6 for poses, which is much faster.
-        """
+        """Return states at N times, and the (N, dim, dim) covariance of their leading error components; 6 is faster than 18."""
         found = [self._at(time_s[i : i + _CHUNK], dim) for i in range(0, len(time_s), _CHUNK)]
         if len(found) == 1:
             return found[0]
@@ -213,8 +208,8 @@ def state_at_point(
 ) -> tuple[States, FloatArray]:
     """Motion of another point of the rigid robot, and the (N, 6, 6) covariance of its position's and rotation's errors.
 
-    ``covariance`` is that of the states' errors, (N, d, d), d >= 6; ``lever_arm``, (3,) in the robot frame in m, points
-    from the states' reference point to the other point.
+    ``covariance``: of the states' errors, (N, d, d), d >= 6. ``lever_arm``: from their reference point, (3,) in the robot
+    frame.
     """
     rotation, rate = states.rotation, states.angular_velocity
     lever_velocity = cross(rate, lever_arm)
@@ -235,12 +230,11 @@ def with_second_order_terms(rotation: FloatArray, covariance: FloatArray) -> tup
 
     Two prisms leave a rotation by an angle θ about the line through them unobserved: it displaces a point at the distance r
     from that line by rθ along its circle and by rθ²/2 towards the line, where the first-order sigma may be a millimetre. The
-    mean square of the latter is 3 σ⁴ r² / 4, with σ² the variance of θ. One prism alone leaves rotations about three
-    axes, each of which moves the point closer; the mean product of two of them is σ₁² σ₂² / 4.
+    mean square of the latter is 3 σ⁴ r² / 4, with σ² the variance of θ. One prism alone leaves rotations about three axes,
+    each of which moves the point closer; the mean product of two of them is σ₁² σ₂² / 4.
 
-    ``rotation`` is (N, 3, 3), ``covariance`` (N, 6, 6) as from :func:`state_at_point`. Returns the covariance with
-    these terms and one sigma of θ in rad, (N,), the least certain rotation; NaN where rounding made its variance
-    negative.
+    From rotations, (N, 3, 3), and (N, 6, 6) of :func:`state_at_point`. Returns the covariance with these terms and one sigma
+    of θ in rad, (N,), the least certain rotation; NaN where rounding made its variance negative.
     """
     variance, axes = np.linalg.eigh(covariance[:, 3:, 3:])
     # The displacement per rad is the covariance with the rotation over its variance; the variance cancels in the square.

@@ -29,11 +29,8 @@ if TYPE_CHECKING:
 
     from tsgt.model import MotionPrior
 
-STATE_DIM = 18
-"""Components of a state's error."""
-
-_MIN_WRAP_RAD = 0.3
-"""Smaller rotations between two states are never taken the long way round."""
+STATE_DIM = 18  # Components of a state's error
+_MIN_WRAP_RAD = 0.3  # Smaller rotations between two states are never taken the long way round
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,11 +111,7 @@ class ProcessFactors:
 
 @dataclass(frozen=True, slots=True)
 class LinearisedProcess:
-    """Residuals and Jacobians of K - 1 process factors.
-
-    The residual of an axis is ``later - Phi earlier``. It is linear in the states except for the rotation, whose Jacobians
-    depend on them.
-    """
+    """Residuals and Jacobians of K - 1 process factors: ``later - Phi earlier`` by axis, linear except for the rotation."""
 
     earlier: FloatArray  # (K - 1, 6, 3) per axis: zero, velocity and acceleration of the earlier knot
     # (K - 1, 6, 3) displacement or rotation vector from the earlier knot, velocity and acceleration of the later knot
@@ -132,8 +125,8 @@ def linearise_process(knots: States, factors: ProcessFactors) -> LinearisedProce
     """Residuals and exact Jacobians of the process factors.
 
     The rotation vector between two knots is the integral of the angular velocity only for a fixed axis of rotation. For a
-    moving axis, dt^2 / 12 times the cross product of both angular velocities is subtracted (Magnus expansion, W.
-    Magnus, 1954, to fourth order in dt); the rest is linear in the angular acceleration, like the prior.
+    moving axis, dt^2 / 12 times the cross product of both angular velocities is subtracted (Magnus expansion, W. Magnus,
+    1954, to fourth order in dt); the rest is linear in the angular acceleration, like the prior.
     """
     count = len(knots) - 1
     rotvec = rotation_between(knots.select(slice(None, -1)), knots.select(slice(1, None)))
@@ -163,10 +156,9 @@ def add_process_factors(
     off_diagonal: FloatArray,
     gradient: FloatArray,
 ) -> float:
-    """Add the K - 1 process factors to the normal equations, in place; only the rotation's Jacobians are not constant.
+    """Add the K - 1 process factors to the normal equations, in place; return the sum of squared Mahalanobis distances.
 
-    Shapes of ``diagonal``, ``off_diagonal`` and ``gradient``: (K, 18, 18), (K - 1, 18, 18), (K, 18). Returns the sum of
-    the squared Mahalanobis distances of the residuals.
+    Shapes of ``diagonal``, ``off_diagonal`` and ``gradient``: (K, 18, 18), (K - 1, 18, 18), (K, 18).
     """
     count = len(factors.phi)
     translation = slice(0, 3)
@@ -218,8 +210,7 @@ def _translation_blocks(matrix: FloatArray) -> FloatArray:
 def rotation_between(before: States, after: States) -> FloatArray:
     """Rotation vectors between states in rad, (N, 3), longer than pi where the angular velocities say so.
 
-    A robot that keeps turning through an outage may come back the long way round. Below 0.3 rad a whole revolution and
-    none are indistinguishable, and the short way is taken.
+    Below 0.3 rad a whole revolution and none are indistinguishable, and the short way is taken.
     """
     rotvec = fast_log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
     dt_s = (after.time_s - before.time_s)[:, None]

@@ -35,17 +35,13 @@ if TYPE_CHECKING:
 
 Daemon = ClientConfig | MasterConfig
 
-BYTES_PER_HOUR = {"client": 22_000_000, "master": 145_000_000}
-"""Journal at 20 Hz; recording of three stations at 2.5 Hz with 20 poses per second."""
-
+BYTES_PER_HOUR = {"client": 22_000_000, "master": 145_000_000}  # At 20 Hz; 3 stations at 2.5 Hz, 20 poses/s
 MIN_HOURS = 12  # A day in the field
 SLOW_FSYNC_NS = 1_000_000_000  # A slower disk loses more than the second that a power cut may cost
 _FSYNC_BYTES = 65_536
 _FSYNCS = 5
 
-MAX_FRAMES_AGE_NS = 12 * 3600 * 1_000_000_000
-"""Older station frames belong to another set-up, unless the tripods have stayed."""
-
+MAX_FRAMES_AGE_NS = 12 * 3600 * 1_000_000_000  # Older ones are of another set-up, unless tripods stayed
 VOLATILE = {"tmpfs", "ramfs", "overlay"}  # File systems that lose their changes at a power cut
 
 

@@ -43,11 +43,7 @@ class AtmosphereRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AtmosphereResponse:
-    """Response to a request.
-
-    ``problem``: the reason why the setting was not applied, or not yet; empty when it was. ``settings``: identity and
-    settings of the instrument as read back; null where unknown.
-    """
+    """Why the setting was not applied, or not yet (empty: it was), and the settings as read back (null: unknown)."""
 
     type: Literal["answer"] = "answer"
     problem: str = ""

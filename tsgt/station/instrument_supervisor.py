@@ -40,10 +40,7 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """The result of a command.
-
-    ``reading``: result of a successful :class:`~tsgt.radio.commands.MeasureCommand`; None for all others.
-    """
+    """The result of a command; with a reading after a successful :class:`~tsgt.radio.commands.MeasureCommand`."""
 
     command: Command
     ok: bool
@@ -102,10 +99,7 @@ class InstrumentSupervisor:
         return condition if self.description is not None else replace(condition, problem=self._error)
 
     def submit(self, command: Command) -> None:
-        """Execute a command as soon as the instrument is free; one at a time.
-
-        Fails at once without an instrument, and for a single measurement while a prism is tracked.
-        """
+        """Execute a command when the instrument is free; fails without one, and for a measurement while tracking."""
         tracking = self._session.mode == "tracking"
         if self.description is None or (tracking and isinstance(command, MeasureCommand)):
             self._on_result(CommandResult(command, ok=False))
@@ -114,10 +108,7 @@ class InstrumentSupervisor:
         self._interrupt()
 
     async def set_atmosphere(self, atmosphere: Atmosphere) -> str:
-        """Set the atmospheric correction as soon as the instrument is free, and again after each connection.
-
-        Returns the reason why it is not set, or not yet; empty when it is.
-        """
+        """Set it now and after each connection; return why it is not set, or not yet, empty when it is."""
         _respond(self._atmosphere_response, "superseded by a later request")
         self._atmosphere = atmosphere
         if self.description is None:

@@ -16,11 +16,7 @@ ProtocolName = Literal["classic", "superframe"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStatus:
-    """The radio link's part of :class:`ClientStatus`.
-
-    ``master_received_ns``: RxDone of the master's last packet for this station, on the station's Unix clock; None
-    before the first.
-    """
+    """The radio link's part; ``master_received_ns``: RxDone of the master's last packet, station's Unix clock."""
 
     protocol: ProtocolName
     master_received_ns: int | None

@@ -42,11 +42,7 @@ RESPONSE_TIMEOUT_S = 30.0  # time for any command; a two-face measurement of a t
 
 
 class BridgeInstrument:
-    """An :class:`~tsgt.station.instrument.Instrument`.
-
-    ``clock``: CLOCK_MONOTONIC, which the program uses for its timestamps too. ``start``: starts the program; None: as a
-    child process.
-    """
+    """An :class:`~tsgt.station.instrument.Instrument`; ``clock`` is CLOCK_MONOTONIC, as in the program's timestamps."""
 
     def __init__(
         self, config: BridgeInstrumentConfig, clock: Clock, start: StartProgram | None = None

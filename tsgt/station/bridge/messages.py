@@ -56,19 +56,7 @@ class HelloLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Measurement:
-    """Common fields of both kinds of measurements; see :class:`~tsgt.station.instrument.Reading`.
-
-    Attributes
-    ----------
-    horizontal_angle_rad, zenith_angle_rad
-        0 to 2 pi; null without angles.
-    slope_distance_m
-        Positive; null without a distance.
-    host_time_ns
-        Time of the measurement on CLOCK_MONOTONIC; null where unknown.
-    instrument_time_ns
-        The same on the instrument's clock.
-    """
+    """Fields of both; angles 0 to 2 pi, distance positive, ``host_time_ns`` on CLOCK_MONOTONIC; null where unknown."""
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
@@ -159,10 +147,7 @@ _KINDS: dict[str, type[ProgramLine]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackLine:
-    """Track a prism; if it is tracked already, search for it again.
-
-    ``towards`` is its expected direction; null: where the telescope points, or its last direction.
-    """
+    """Track a prism, or search again, at ``towards``; null: where the telescope points, or the last direction."""
 
     type: Literal["track"] = "track"
     id: int
@@ -216,8 +201,8 @@ class BridgeVersionError(ValueError):
 def decode_program_line(data: bytes) -> ProgramLine | None:
     """Decode a line of a program; None for an unknown type.
 
-    Raises BridgeVersionError if it is the ``hello`` of another version. Raises ValueError if it is not JSON, or a field
-    is missing or invalid; the message, one line, names the first.
+    Raises BridgeVersionError for the ``hello`` of another version, and ValueError (one line) if it is not JSON
+    or a field is missing or invalid.
     """
     kind = decode(Typed, data).type
     if kind == "hello" and (version := decode(_Versioned, data).bridge) != FORMAT_VERSION:

@@ -57,10 +57,7 @@ StartProgram = Callable[[Sequence[str], Listener], Coroutine[Any, Any, Program]]
 
 
 async def start_process(command: Sequence[str], listener: Listener, clock: Clock) -> Program:
-    """Start a program as a child process, in a session of its own so that Ctrl-C does not reach it.
-
-    Raises InstrumentError if it cannot be started: no such program, no permission.
-    """
+    """Start a child process in a session of its own, which Ctrl-C does not reach; raises InstrumentError on failure."""
     environment = dict(os.environ)
     environment.pop("NOTIFY_SOCKET", None)  # it must not notify systemd on behalf of the service
     try:

@@ -37,10 +37,7 @@ class TimestampedLine(NamedTuple):
 
 
 class LineTimestamper:
-    """Determines the time of each measurement; outlives the program, so that a restart repeats none.
-
-    ``latency_ns``: time from a measurement to the program's timestamp; subtracted.
-    """
+    """Determines times of measurements, ``latency_ns`` before the program's timestamps; outlives the program."""
 
     def __init__(self, latency_ns: int) -> None:
         self._latency_ns = latency_ns
@@ -89,10 +86,7 @@ class LineTimestamper:
         return [self._checked(line, prism, received_ns, received_ns, MAX_AGE_NS)]
 
     def _is_repeat(self, line: MeasurementLine) -> bool:
-        """Whether this measurement has the time and the values of the one before it.
-
-        One with the same time and other values is new, and its time is too coarse.
-        """
+        """Whether it repeats time and values of the one before; with other values it is new, and its time too coarse."""
         time_ns = line.host_time_ns if line.instrument_time_ns is None else line.instrument_time_ns
         if time_ns is None:
             return False

@@ -1,10 +1,8 @@
-"""Encodes requests and decodes replies of GeoCOM's ASCII protocol, which Leica total stations use on a serial line. Sans-I/O.
+"""Encodes requests and decodes replies of GeoCOM's ASCII protocol, for Leica instruments on a serial line. Sans-I/O.
 
-A request is ``%R1Q,<rpc>,<transaction>:<parameters>``, its reply ``%R1P,<com code>,<transaction>:<code>,<values>``; both
-end in CR LF. The com code reports whether the request was delivered and understood, the return code its result. With
-checksums both headers have a third number. Lengths are in metres, angles in radians.
-
-Source: Leica, TPS1200 GeoCOM Reference Manual, version 1.20; the checksum was found by experiment (GeoComPy 1.0).
+``%R1Q,<rpc>,<transaction>:<parameters>`` is answered by ``%R1P,<com code>,<transaction>:<code>,<values>``; both end in
+CR LF. The com code is the transport's result, the return code the procedure's. With checksums both headers have a third
+number. Metres and radians. Source: Leica, TPS1200 GeoCOM Reference Manual 1.20; the checksum: GeoComPy 1.0.
 """
 
 from __future__ import annotations

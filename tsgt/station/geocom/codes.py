@@ -14,32 +14,21 @@ from typing import Final, Self
 class Outcome(Enum):
     """Meaning of a return code for the caller."""
 
-    USABLE = auto()
-    """Executed, or measured; also with a warning about the battery."""
+    USABLE = auto()  # executed, or measured; also with a warning about the battery
     LOW_ACCURACY = auto()
     """Distance and angles are valid, but a correction is missing or uncertain: common while the telescope turns."""
-    ANGLE_ONLY = auto()
-    """The angles are valid, there is no distance."""
-    NO_TARGET = auto()
-    """No prism is detected, or no distance can be measured to it."""
-    TILT = auto()
-    """Nothing is valid, usually because the instrument is not level."""
+    ANGLE_ONLY = auto()  # the angles are valid, there is no distance
+    NO_TARGET = auto()  # no prism is detected, or no distance can be measured to it
+    TILT = auto()  # nothing is valid, usually because the instrument is not level
     WRONG_DISTANCE = auto()
     """The distance is unusable because of the instrument's settings for its correction."""
-    BUSY = auto()
-    """A procedure is in progress, or a distance is still stored: retry later, or after clearing."""
-    ASLEEP = auto()
-    """The instrument sleeps or is off; a request wakes it up."""
-    LICENCE = auto()
-    """Not permitted: the licence GeoCOM Robotic is missing."""
-    UNAVAILABLE = auto()
-    """Not supported: no such procedure, or no such component."""
-    SHUT_DOWN = auto()
-    """The instrument is switching off."""
-    NO_VALUES = auto()
-    """The code announces values, and none came."""
-    ERROR = auto()
-    """Not executed."""
+    BUSY = auto()  # a procedure is in progress, or a distance is still stored: retry later, or after clearing
+    ASLEEP = auto()  # the instrument sleeps or is off; a request wakes it up
+    LICENCE = auto()  # not permitted: the licence GeoCOM Robotic is missing
+    UNAVAILABLE = auto()  # not supported: no such procedure, or no such component
+    SHUT_DOWN = auto()  # the instrument is switching off
+    NO_VALUES = auto()  # the code announces values, and none came
+    ERROR = auto()  # not executed
 
 
 class ReturnCode(IntEnum):
@@ -226,10 +215,7 @@ _FAMILIES: Final = {
 
 
 def outcome_of(code: int, *, has_values: bool) -> Outcome:
-    """Return the meaning of a return code.
-
-    ``has_values``: whether the reply has values. A code that announces valid ones without is :attr:`Outcome.NO_VALUES`.
-    """
+    """Return the meaning of a return code; one that announces valid values without any is NO_VALUES."""
     known = _BY_NUMBER.get(code)
     outcome = Outcome.ERROR if known is None else known.outcome
     if outcome is Outcome.ERROR and has_values and code in _TMC_WARNINGS:

@@ -1,8 +1,7 @@
-"""A connection to a GeoCOM instrument: requests and replies over a line that may lose, delay, duplicate and damage them.
+"""A connection to a GeoCOM instrument over a line that may lose, delay, duplicate and damage requests and replies.
 
-Every request has a transaction number, which its reply repeats; late and duplicate replies are dropped by it. An instrument
-takes one request at a time: after a cancelled call the next request waits until the pending reply has come or cannot come
-any more.
+Late and duplicate replies are recognised by their transaction number. An instrument takes one request at a time: after a
+cancelled call the next one waits until the pending reply has come or cannot come any more.
 """
 
 from __future__ import annotations
@@ -117,10 +116,7 @@ class _Pending:
 
 
 class GeoComConnection:
-    """The owner of a port to a GeoCOM instrument.
-
-    ``decimals``: number of decimals sent; must equal the instrument's setting.
-    """
+    """The owner of a port to a GeoCOM instrument; ``decimals`` sent must equal the instrument's setting."""
 
     def __init__(self, port: Port, clock: Clock, *, checksum: bool = False) -> None:
         self.port = port

@@ -1,9 +1,7 @@
 """Identity, capabilities and power supply of a Leica instrument: what it reports, and what is known of its model.
 
-Sources: the delays between distance and angles are constants of the University of Bonn's open tracking software
-(rts-network), calibrated there; the prefixes of names are as instruments of each series report them. The latency from a
-measurement to the fastest reply is unknown for every model: published figures include the serial line. Measure it, or
-estimate it from a recording in motion, and configure it.
+The delays between distance and angles are those of the University of Bonn's tracking software (rts-network). The latency
+to the fastest reply is unknown, as published figures include the serial line: measure it, or estimate it from motion.
 """
 
 from __future__ import annotations

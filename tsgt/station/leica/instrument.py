@@ -52,11 +52,7 @@ _NO_LICENCE: Final = (
 
 
 class LeicaInstrument:
-    """An :class:`~tsgt.station.instrument.Instrument`.
-
-    It cannot tell prisms apart: :meth:`track` with another number and no direction calls the operator to point the
-    telescope.
-    """
+    """An :class:`~tsgt.station.instrument.Instrument`; needs the operator for another prism without a direction."""
 
     def __init__(self, config: LeicaInstrumentConfig, open_port: OpenPort, clock: Clock) -> None:
         self._config = config

@@ -1,9 +1,8 @@
 """Which search window to try next after the target is lost, and when an operator has pointed the telescope. Sans-I/O.
 
-An instrument that loses its target predicts the target's path for some seconds and locks on by itself if it reappears. After
-that the driver searches: a small window at the current pointing, a window at the direction from the master's poses, one
-around the last direction, a wide one, and the full circle if the configuration allows it. Then it calls the operator, pauses,
-and starts over.
+After a loss the instrument predicts the target's path for some seconds and locks on by itself. Then the driver searches:
+at the current pointing, at the direction from the master's poses, around the last direction, wide, and the full circle if
+configured. Then it calls the operator, pauses, and starts over.
 """
 
 from __future__ import annotations
@@ -99,10 +98,7 @@ def window_at_direction(direction: Direction) -> SearchWindow:
 
 
 class ReacquisitionSequence:
-    """Sequence of search windows while the instrument is not locked on.
-
-    ``width_rad``, ``height_rad``: full width and height of the widest window.
-    """
+    """Sequence of search windows while the lock is lost; the widest has the given full width and height."""
 
     def __init__(self, *, width_rad: float, height_rad: float) -> None:
         self._width_rad = width_rad
@@ -152,10 +148,7 @@ class ReacquisitionSequence:
         self._telescope_moved = False
 
     def next(self, lock: Lock, now_ns: int) -> SearchWindow | None:
-        """Return the window to search now; None: keep measuring and query the lock again soon.
-
-        A returned window counts as done, whatever its result.
-        """
+        """Return the window to search now, which then counts as done; None: keep measuring and query the lock again."""
         if lock is Lock.IN:
             self._predicting_since_ns = None
             return None

@@ -58,10 +58,7 @@ class TargetSearch:
         await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 0)
 
     async def search(self, window: SearchWindow) -> bool:
-        """Search a window and lock on; return whether the instrument is locked on now.
-
-        Switches the target recognition on first: doing that after the lock would release it.
-        """
+        """Search a window and lock on, with target recognition on first; return whether it is locked on now."""
         self.target_found = False
         await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 0)
         await self._call(Rpc.AUS_SET_USER_ATR_STATE, 1)

@@ -148,10 +148,7 @@ def atmospheric_correction(atmosphere: Atmosphere) -> Setting:
 def wet_bulb_temperature_c(temperature_c: float) -> float:
     """Return the wet-bulb temperature at 60 % relative humidity, which Leica's formula assumes.
 
-    Notes
-    -----
-    R. Stull, "Wet-Bulb Temperature from Relative Humidity and Air Temperature", J. Appl. Meteorol. Climatol. 50, 2011,
-    equation 1, valid from -20 to 50 degrees Celsius.
+    R. Stull, J. Appl. Meteorol. Climatol. 50, 2011, equation 1, valid from -20 to 50 degrees Celsius.
     """
     t = min(max(temperature_c, -20.0), 50.0)
     humidity = 60.0

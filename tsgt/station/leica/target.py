@@ -94,10 +94,7 @@ def _face_difference_rad(first: FullMeasurement, second: FullMeasurement) -> tup
 
 
 def check_same_target(first: FullMeasurement, second: FullMeasurement) -> None:
-    """Check that two faces measured the same target.
-
-    Raises InstrumentRefusedError if they differ by more than the instrument's axis errors.
-    """
+    """Raise InstrumentRefusedError if two faces differ by more than the axis errors: they measured two targets."""
     if first.distance_m is None or second.distance_m is None:
         return
     horizontal_rad, vertical_rad = _face_difference_rad(first, second)

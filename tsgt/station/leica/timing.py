@@ -49,10 +49,7 @@ _REPEAT_WINDOW_MS: Final = 60_000  # a distance older than the last one by less 
 
 
 class DistanceTimestamper:
-    """Maps the times of one instrument's distances to the host's clock.
-
-    ``latency_ns``: time from a measurement to the fastest reply; subtracted.
-    """
+    """Maps the times of one instrument's distances to the host's clock, less ``latency_ns`` to the fastest reply."""
 
     def __init__(self, latency_ns: int) -> None:
         self.latency_ns = latency_ns

@@ -67,11 +67,7 @@ _PROBE_EVERY: Final = (
 
 
 class PollScheduler:
-    """Schedules polls from the intervals of the instrument's distances.
-
-    Between two distances the instrument repeats the last one. Where distances arrive more slowly than replies, most polls
-    would be useless.
-    """
+    """Schedules polls from the interval of distances: between two, the instrument repeats the last one."""
 
     def __init__(self) -> None:
         self._last_ms: int | None = None
@@ -91,11 +87,7 @@ class PollScheduler:
         self._count += 1
 
     def next_ns(self, distance_ns: int, round_trip_ns: int) -> int:
-        """Return when to poll for the distance after one; 0: at once.
-
-        ``distance_ns``: when the fastest reply with that one could have arrived. ``round_trip_ns``: from a request to
-        the fastest reply.
-        """
+        """Return when to poll after a distance, whose fastest reply could arrive at ``distance_ns``; 0: at once."""
         interval_ns = self.interval_ns
         if interval_ns is None or self._count % _PROBE_EVERY == 0:
             return 0

@@ -18,10 +18,7 @@ log = structlog.get_logger()
 
 
 class UnknownTrafficMonitor:
-    """Counts packets of unknown origin since the master's last one, and warns when the master stays silent.
-
-    ``packets``: number of unknown packets since the master's last one.
-    """
+    """Counts packets of unknown origin since the master's last one; warns when the master stays silent."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock

@@ -14,10 +14,7 @@ class Chunk(NamedTuple):
 
 
 class Port(Protocol):
-    """An open port with one owner.
-
-    Every method raises :class:`~tsgt.errors.InstrumentError` once the line is lost; the owner then closes and reopens it.
-    """
+    """An open port with one owner; methods raise InstrumentError once the line is lost: close it then, and reopen."""
 
     @property
     def name(self) -> str:

@@ -77,10 +77,7 @@ def port_holder(path: Path, *, root: Path = _ROOT) -> str | None:
 
 
 def latency_timer_ms(path: Path, *, root: Path = _ROOT) -> int | None:
-    """Return the latency timer of a USB adapter, for which it holds data back; None without one.
-
-    FTDI adapters have one, 16 ms by default. Others have a fixed delay, or none.
-    """
+    """Return the time for which a USB adapter holds data back; FTDI: 16 ms by default. None: without a timer."""
     try:
         return int(_latency_timer(path, root).read_text(encoding="ascii"))
     except (OSError, ValueError):

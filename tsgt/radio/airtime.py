@@ -1,8 +1,7 @@
 """Time on air of a LoRa packet, in integers (SX1276 data sheet 4.1.1.6 and 4.1.1.7).
 
-A coding rate is given by its denominator, 5 to 8 for 4/5 to 4/8. Bandwidths are the nominal ones of the data sheet.
-Results are exact at 31.25, 62.5, 125, 250 and 500 kHz, where a symbol lasts a whole number of nanoseconds; elsewhere they
-are rounded half up.
+A coding rate is given by its denominator, 5 to 8. Results are exact at 31.25, 62.5, 125, 250 and 500 kHz, where a symbol
+lasts a whole number of nanoseconds; at the other nominal bandwidths they are rounded half up.
 """
 
 from __future__ import annotations
@@ -100,10 +99,7 @@ def airtime_us(
 
 
 def bit_rate_Bps(spreading_factor: int, bandwidth_hz: int, coding_rate: int) -> float:  # noqa: N802 (unit)
-    """Return the nominal payload rate, SF * 4/CR * BW / 2^SF, in bytes per second.
-
-    It excludes preamble, header and the cost of the low data rate optimisation.
-    """
+    """Return the nominal payload rate SF * 4/CR * BW / 2^SF in bytes/s, without preamble, header, optimisation."""
     return spreading_factor * 4 * bandwidth_hz / ((coding_rate << spreading_factor) * 8)
 
 

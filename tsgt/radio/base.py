@@ -142,10 +142,7 @@ class Radio(Protocol):
     """A half-duplex LoRa radio; it receives whenever it does not send."""
 
     async def configure(self, settings: LoRaSettings) -> None:
-        """Change the settings of a running radio.
-
-        Raises RadioError if the radio does not accept them; it retries in the background.
-        """
+        """Change the settings; raises RadioError if the radio does not accept them, and retries in the background."""
         ...
 
     async def transmit(self, payload: bytes, *, at_ns: int | None = None) -> Transmission:

@@ -33,10 +33,7 @@ class TrackCommand:
 
 @dataclass(frozen=True, slots=True)
 class SearchCommand:
-    """Search for the tracked prism, even if the instrument reports lock; None: where the station last had it.
-
-    The protocol classic does not have this command.
-    """
+    """Search for the prism even if locked; None: where the station last had it. Not in the protocol classic."""
 
     towards: Direction | None = None
 

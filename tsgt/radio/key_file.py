@@ -62,10 +62,7 @@ def read_key(path: Path, *, owner: int | None = None) -> bytes:
 
 
 def write_key(path: Path) -> None:
-    """Write a new random key into a new file that only its owner may read.
-
-    Raises OutputFileError if the file exists, or cannot be written.
-    """
+    """Write a random key into a new file that only its owner may read; raises OutputFileError on failure."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:

@@ -1,8 +1,7 @@
 """A bench test of two radios: one sends requests, the other replies to each at once.
 
-A request is a tag, the session's number and its own number, padded to the requested length. A reply is as long, and also
-reports how the request was received and the turnaround of the reply before it, as a reply cannot contain its own. All
-numbers are little-endian.
+A request is a tag and the numbers of session and request, padded. A reply is as long, and reports how the request was
+received and the previous turnaround, as it cannot contain its own. All numbers are little-endian.
 """
 
 from __future__ import annotations

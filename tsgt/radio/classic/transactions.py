@@ -1,11 +1,8 @@
 """The master's side of the paper's protocol: what it does with one station while all others are silent. Sans-I/O.
 
-The master sends a request, and one station replies (:class:`~tsgt.radio.classic.station.ClassicStation`). A transaction
-is a sequence of requests: a poll, a command, a synchronisation. It returns the next request and takes each packet that
-the radio receives until it accepts one as the reply, or the reply timeout has passed.
-
-The protocol has no sequence numbers to distinguish a late reply from the expected one, and two of its replies do not even
-name their station. :class:`Synchronisation` lists the guards against a wrong clock sample.
+A transaction is a sequence of requests to a :class:`~tsgt.radio.classic.station.ClassicStation`: it takes each received
+packet until it accepts one as the reply, or the reply timeout has passed. Replies have no sequence numbers, and two kinds
+do not even name their station: :class:`Synchronisation` lists the guards against a wrong clock sample.
 """
 
 from __future__ import annotations
@@ -41,10 +38,7 @@ SINGLE_MEASUREMENT_TIMEOUT_NS = 20_000_000_000  # timeout of a single measuremen
 
 @dataclass(frozen=True, slots=True)
 class LinkTiming:
-    """Durations of packets and timeouts at one modem setting.
-
-    ``reply_timeout_ns``: from the end of a request to RxDone of its reply, as configured.
-    """
+    """Durations at one modem setting; ``reply_timeout_ns``: from the end of a request to RxDone of its reply."""
 
     settings: LoRaSettings
     reply_timeout_ns: int
@@ -104,10 +98,7 @@ class Transaction(ABC):
 
 
 class Poll(Transaction):
-    """Requests a station's newest measurement, once.
-
-    ``message``: the reply; None without one. It may repeat that of an earlier poll.
-    """
+    """Requests a station's newest measurement, once; the ``message`` may repeat that of an earlier poll."""
 
     def __init__(self, station: int, timing: LinkTiming) -> None:
         super().__init__(station)

@@ -190,19 +190,7 @@ class _Frame(NamedTuple):
 
 
 class _Slot(NamedTuple):
-    """Means over a station's slots.
-
-    Attributes
-    ----------
-    granted_ns, granted_sigma_ns
-        Duration of a slot, and its sigma.
-    sent_ns
-        Airtime of a reply.
-    carrying_ns
-        Airtime of the reply that carries a measurement, weighted by measurements.
-    max_measurements
-        Number of measurements that fit.
-    """
+    """Means over a station's slots; ``carrying_ns``: airtime of a measurement's reply, by measurements."""
 
     granted_ns: float
     granted_sigma_ns: float
@@ -268,11 +256,7 @@ def _phases(stations: int) -> Iterator[list[float]]:
 
 
 def _locked(load: TrafficLoad, frame: _Frame, phases: Sequence[float]) -> _Waits | None:
-    """Return the waits in phase-locked frames; None where that gains nothing.
-
-    :class:`~tsgt.radio.superframe.phase_lock.PhaseLock` chooses likewise the slot order and the station whose
-    measurement is fetched as soon as it is ready. ``phases`` are those of the instruments, as fractions of a period.
-    """
+    """Return the waits in frames that ``PhaseLock`` chooses, phases as fractions of a period; None: no gain."""
     period_ns = load.period_ns
     periods = max(math.ceil(frame.duration_ns / period_ns), 1)
     pause_ns = periods * period_ns - frame.duration_ns

@@ -1,8 +1,7 @@
 """What may be transmitted where: power presets and limits of regions and chip, and the violations of a planned use.
 
-ERC/REC 70-03 and EN 300 220-2 for Europe (power is e.r.p.); 47 CFR 15.247 and 15.249 for the USA, RSS-247 and RSS-210 for
-Canada; the SX1276's data sheet. As of 2026; the local law decides, not this table. The presets assume a dipole, so that
-the e.r.p. is the power at the pin.
+ERC/REC 70-03 and EN 300 220-2 (Europe, e.r.p.); 47 CFR 15.247 and 15.249 (USA), RSS-247 and RSS-210 (Canada); SX1276 data
+sheet. As of 2026; the local law decides. The presets assume a dipole, so that the e.r.p. is the power at the pin.
 """
 
 from __future__ import annotations
@@ -71,19 +70,13 @@ REGIONS: dict[str, tuple[Band, ...]] = {
 
 
 def preset_power_dbm(region: str, *, frequency_hz: int, bandwidth_hz: int) -> int:
-    """Return the preset power at the PA_BOOST pin for a channel in a region.
-
-    Raises RadioSettingsError if the channel does not lie in any band of the region.
-    """
+    """Return the preset power at the PA_BOOST pin; raises RadioSettingsError for a channel outside the region."""
     bands = bands_of(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
     return min(band.power_dbm if bandwidth_hz >= band.min_bandwidth_hz else MIN_POWER_DBM for band in bands)
 
 
 def bands_of(region: str, *, frequency_hz: int, bandwidth_hz: int) -> tuple[Band, ...]:
-    """Return the band of a channel, or the adjoining bands.
-
-    Raises RadioSettingsError if the channel does not lie within the bands of the region.
-    """
+    """Return the band of a channel, or the adjoining bands; raises RadioSettingsError outside the region's bands."""
     low_hz, high_hz = frequency_hz - bandwidth_hz // 2, frequency_hz + bandwidth_hz // 2
     touched = tuple(band for band in REGIONS[region] if band.low_hz < high_hz and low_hz < band.high_hz)
     if (

@@ -1,9 +1,8 @@
 """The superframe: the TDMA protocol between one master and up to 16 stations, both sides, sans-I/O.
 
-In: packets with their timestamps, measurements, commands, time, random bits. Out: beacons, replies, start and end of
-slots, measurements on the master's clock. The master sends a beacon with grants and acknowledgements in each frame; the
-stations reply in their slots. :class:`SuperframeMaster` and :class:`SuperframeStation` are the two sides, ``wire`` encodes
-and authenticates their messages.
+In: packets with timestamps, measurements, commands, time, random bits. Out: beacons, replies, start and end of slots, and
+measurements on the master's clock. In each frame the master sends a beacon with grants and acknowledgements, and the
+stations reply in their slots. ``wire`` encodes and authenticates the messages.
 """
 
 from tsgt.radio.superframe.command_exchange import InstrumentState

@@ -58,8 +58,8 @@ _NOISE = (31, -17, 54, -40, 8, -62, 25)
 
 _GAP = 3  # assumed gap of the sequence numbers after a loss
 
-EARLY_US = 5_000
-EARLY_SPREADS = 3  # how early a measurement may be: a constant, plus a multiple of the jitter of its period
+EARLY_US = 5_000  # how early a measurement may be,
+EARLY_SPREADS = 3  # plus this multiple of the jitter of its period
 
 
 INITIAL_EXCHANGES = 8
@@ -228,10 +228,7 @@ class DemandEstimator:
         exchanges: int,
         pending: Command | None,
     ) -> Demand | None:
-        """Predict the reply in a frame whose slot starts at ``slot_us`` in session time, after ``exchanges`` two-way ones.
-
-        None before the first reply with a measurement.
-        """
+        """Predict the reply in a slot at ``slot_us`` session time, after ``exchanges``; None before a measurement."""
         newest_us = self._periodicity.newest_us
         if newest_us is None or self._replied_us is None:
             return None

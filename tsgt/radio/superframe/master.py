@@ -1,13 +1,9 @@
 """The master's side of the superframe: sends beacons, receives replies. Sans-I/O: time and random bits are passed in.
 
-A frame goes through these steps. :meth:`SuperframeMaster.prepare` plans slots and the start of the beacon.
-:meth:`~SuperframeMaster.compose` returns the beacon, as late as possible, so that it acknowledges what has been recorded
-until then. :meth:`~SuperframeMaster.sent` takes its TxDone, :meth:`~SuperframeMaster.received` the replies, and
-:meth:`~SuperframeMaster.finish` returns the silent stations. A frame may be aborted at any step: the next one starts
-with ``prepare``, and no acknowledgement is revoked.
-
-A reply does not contain its station. The station is the one whose authentication code matches: the code covers session,
-frame, beacon and station.
+A frame: :meth:`SuperframeMaster.prepare` plans it, :meth:`~SuperframeMaster.compose` returns the beacon as late as possible
+to acknowledge what is recorded, then ``sent`` takes TxDone, ``received`` the replies, and ``finish`` returns the silent
+stations. It may be aborted at any step: the next one starts with ``prepare``, and no acknowledgement is revoked. A reply's
+station is the one whose authentication code matches: the code covers session, frame, beacon and station.
 """
 
 from __future__ import annotations

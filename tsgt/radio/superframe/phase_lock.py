@@ -1,12 +1,9 @@
 """Starts frames in phase with the instruments, which minimises the age of measurements on arrival. Sans-I/O.
 
-Frames that follow each other immediately drift through the instruments' measurement phase: a measurement waits half a
-frame on average. Frames as long as the measurement period, or a multiple, keep their phase. The slot order and the start
-of the beacon are then chosen so that the measurement of one station, the reference, is ready when its slot comes, and the
-others are as young as their phases allow. This pays off where frames have to be nearly as long as the period anyway.
-
-Reference and slot order change only for a gain; the clocks' slow drift is followed from frame to frame. After a frame
-that took too long, frames start immediately until they are in phase again. A whole frame that fits in before is inserted.
+In frames that follow each other at once a measurement waits half a frame on average. Frames as long as its period, or a
+multiple, keep their phase: slot order and beacon start are chosen so that the measurement of one station, the reference, is
+just ready for its slot. This pays off where frames have to be nearly as long anyway, and changes only for a gain. After a
+frame that took too long, frames start at once until in phase again. A whole frame that fits in before is inserted.
 """
 
 from __future__ import annotations
@@ -112,10 +109,7 @@ class PhaseLock:
             self._learn_margin(index, 1000 * time_us)
 
     def plan(self, earliest_ns: int, grants: Sequence[int], beacon_bytes: int) -> FramePlan:
-        """Plan the next frame, which starts at ``earliest_ns`` in session time or later.
-
-        The grants are by station index; ``beacon_bytes`` includes the authentication code.
-        """
+        """Plan the next frame, at or after ``earliest_ns`` session time; ``beacon_bytes`` include the code."""
         self._update_frame_length(earliest_ns)
         self._grants.append(tuple(grants))
         ready, active = self._ready_times(earliest_ns)
@@ -247,11 +241,7 @@ class PhaseLock:
         return gain_ns
 
     def _cost_ns(self, period_ns: float) -> float:
-        """Return the cost of longer and of lagging frames in mean age.
-
-        A frame of several periods carries more measurements, which take part of its time; the extra length of a frame of
-        one period counts half.
-        """
+        """Return the cost in mean age of longer frames (one period: half, as it carries no more) and of lagging ones."""
         frame_ns = _whole_periods_ns(self._need_ns, period_ns)
         longer_ns = frame_ns - self._need_ns
         return (longer_ns if frame_ns > period_ns else longer_ns / 2) + fmean(self._behind_ns)

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 MAX_BLOCK_MEASUREMENTS = 16
 MAX_BLOCKS = 15
 
-MIN_MEASUREMENT_BYTES = 6
-TYPICAL_MEASUREMENT_BYTES = 8  # length of a measurement that is not the first of its block
+MIN_MEASUREMENT_BYTES = 6  # minimum length of a measurement that is not the first of its block
+TYPICAL_MEASUREMENT_BYTES = 8  # usual length of one
 
 _QUALITY_SPREAD = 2
 _GOOD_QUALITY = 7
@@ -55,10 +55,7 @@ class ReplyBuilder:
     def build(
         self, session: StationSession, slot: ReplySlot, state: InstrumentState, report: StatusReport
     ) -> tuple[Reply, tuple[int, ...]]:
-        """Return the reply, and the sequence numbers in it.
-
-        A turnaround comes with a status report, and after the measurements unless it is overdue.
-        """
+        """Return the reply and its sequence numbers; a turnaround comes last, with a status report, unless overdue."""
         limit_bytes = slot.slot.max_reply_bytes
         parts = self._control_parts(session, state, report, limit_bytes)
         urgent = self._by_urgency(session, slot.start_ns, limit_bytes // MIN_MEASUREMENT_BYTES)
@@ -110,12 +107,7 @@ class ReplyBuilder:
     def _by_urgency(
         self, session: StationSession, slot_ns: int, max_measurements: int
     ) -> list[StampedMeasurement]:
-        """Return the measurements that have a time on this master's clock, most urgent first.
-
-        The newest is the most urgent: it serves the robot's control. Then come, in a short queue, the oldest, so that none
-        waits long; in a backlog the next newer ones, so that a lost one is soon repeated. An old one that needs a block of
-        its own may never fit behind the newest, and takes precedence once in a while.
-        """
+        """Return the timed measurements: the newest, then the oldest of a short queue or the next newer of a backlog."""
         deliverable = filter(session.can_timestamp, self._queue.newest_first())
         urgent: list[StampedMeasurement] = []
         for queued in islice(deliverable, max_measurements):

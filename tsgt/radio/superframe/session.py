@@ -182,10 +182,7 @@ class StationSession:
         return joined
 
     def reception(self) -> BeaconReception | None:
-        """Return the clock sample of the previous beacon if the newest carries its time.
-
-        None before the session is confirmed: the times of a replay would corrupt the clock.
-        """
+        """Return the clock sample of the previous beacon; None before the session is confirmed: it may be a replay."""
         before, beacon = self._previous, self.beacon.beacon
         follows = before is not None and before.counter + 1 == self.beacon.counter
         if before is None or not follows or not self.confirmed or not beacon.sent:
@@ -272,11 +269,7 @@ class StationSession:
         return time is not None and quality_of(time.bound_us) is not None
 
     def _discard_untimeable(self) -> int:
-        """Discard measurements that will never have a timestamp; return how many.
-
-        How far back timestamps reach depends on the skew bound of the first minute's beacons. The oldest measurements are
-        discarded first: newer ones get the better timestamps.
-        """
+        """Discard measurements, oldest first, that will never have a timestamp; return how many."""
         if not self.confirmed or not self.clock.converged:
             return 0
         discarded = 0 if self._queue_checked else self._queue.retain(self.can_timestamp)

@@ -1,9 +1,7 @@
 """Slot plan of a frame: start and end of each slot, guard times, latest start of a reply.
 
-All times count from the end of the beacon on the air. Master and stations compute the same plan from the same beacon.
-
-A slot lasts as long as the longest reply of its grant and is followed by a guard time, which covers the start jitter of
-two transmitters and the drift of their clocks within a frame.
+Times count from the end of the beacon on the air; master and stations compute the same plan from it. A slot lasts as long
+as the longest reply of its grant, and a guard time for start jitter and clock drift follows it.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The station's side of the superframe: packets, times and measurements in, replies and commands out. Sans-I/O.
 
-A station replies to everybody who proves to have the key. That the packets are not a replay takes one exchange: the
-station sends a join request with a nonce, and a beacon with this nonce confirms it. Until then the station sends its
-measurements, but accepts no acknowledgement, command or time. A recorded session can be replayed, so another authentic
-session is a candidate only while the confirmed one is silent, and dropped as soon as that is received again.
+A station replies to everybody who proves to have the key. It sends a join request with a nonce; until a beacon with this
+nonce confirms that the packets are no replay, it accepts no acknowledgement, command or time. Another authentic session is
+a candidate only while the confirmed one is silent, and dropped as soon as that is received again.
 """
 
 from __future__ import annotations
@@ -222,10 +221,7 @@ class SuperframeStation:
     # --- Replies ----------------------------------------------------------------------------------------------
 
     def compose(self, instrument_state: InstrumentState, now_ns: int) -> bytes | None:
-        """Return the reply for the slot; None without a slot, and if it is too late or the slot too short.
-
-        Called once, as shortly before the slot as possible; ``now_ns`` is CLOCK_MONOTONIC.
-        """
+        """Return the reply for the slot, composed as late as possible; None: no slot, too late, or slot too short."""
         session = self.session
         if session is None or session.slot is None:
             return None

@@ -45,10 +45,7 @@ class BeaconDelayMonitor:
         self._on_time: int | None = None
 
     def add(self, counter: int, lateness_ns: int, *, beacon_time_sent: bool) -> None:
-        """Take the maximum lateness of the reply to a frame.
-
-        The station can compare this frame's beacon with others only if ``beacon_time_sent``: the next one carries its time.
-        """
+        """Take the maximum lateness of a frame's reply; ``beacon_time_sent``: the next beacon carries this one's time."""
         if lateness_ns > MAX_AMBIGUOUS_DELAY_NS:
             self.delay_ns, self._on_time = max(self.delay_ns, lateness_ns), None
             return

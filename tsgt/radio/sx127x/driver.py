@@ -1,12 +1,8 @@
 """Driver of the SX1276/77/78/79 (RFM95 to RFM98) on asyncio.
 
-Three rules:
-
-- The flags in the chip state *what* happened, an edge of DIO0 only *when*. An edge without its flag is stale and ignored;
-  a flag without its edge is found by polling, and its packet's timestamp has a large sigma.
-- Access to several registers runs without an ``await`` or under one lock, so that transmissions, settings and recovery
-  never interleave.
-- A chip that does anything unexpected is reset and set up from the beginning. There is no other recovery.
+The flags in the chip state *what* happened, an edge of DIO0 only *when*: without its flag it is ignored; a flag without its
+edge is found by polling, and its timestamp has a large sigma. Access to several registers runs without an ``await`` or
+under one lock. A chip that does anything unexpected is reset and set up from the beginning: there is no other recovery.
 """
 
 from __future__ import annotations

@@ -216,8 +216,7 @@ class _Spi:
 class _GpiodHal(_PiHal):
     """Pins of the GPIO character device; the kernel timestamps each edge in its interrupt handler."""
 
-    stamp_sigma_ns = 10_000
-    """Interrupt latency of a Pi is 2 to 10 us (published figures; not measured by us)."""
+    stamp_sigma_ns = 10_000  # interrupt latency of a Pi is 2 to 10 us (published figures; not measured by us)
 
     _EVENT_BUFFER = 64
     _CHIP_LABELS = ("pinctrl-bcm2835", "pinctrl-bcm2711", "pinctrl-rp1")

@@ -135,10 +135,7 @@ def _high_bandwidth(frequency_hz: int, *, wide: bool) -> list[RegisterValue]:
 
 
 def packet_strength(pkt_rssi: int, pkt_snr: int, *, frequency_hz: int) -> tuple[float, float]:
-    """Return RSSI in dBm and SNR in dB of a packet from RegPktRssiValue and RegPktSnrValue (section 5.5.5).
-
-    The carrier selects the port, LF or HF, which have different offsets.
-    """
+    """Return RSSI in dBm and SNR in dB from their registers (section 5.5.5); offsets depend on the port, LF or HF."""
     offset_dbm = reg.RSSI_OFFSET_LF_DBM if frequency_hz < reg.MIN_HF_HZ else reg.RSSI_OFFSET_HF_DBM
     snr_db = (pkt_snr - 256 if pkt_snr > 127 else pkt_snr) / 4
     # Below the noise the RSSI is that of the noise; the signal is lower by the SNR.
@@ -147,10 +144,7 @@ def packet_strength(pkt_rssi: int, pkt_snr: int, *, frequency_hz: int) -> tuple[
 
 
 class RegisterAccess:
-    """Register access; each call is one chip-select window (section 2.2).
-
-    All methods raise :class:`~tsgt.errors.RadioError` when the bus fails.
-    """
+    """Register access, one chip-select window per call (section 2.2); raises RadioError when the bus fails."""
 
     def __init__(self, hal: Hal) -> None:
         self._hal = hal

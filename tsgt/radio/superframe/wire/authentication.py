@@ -1,8 +1,7 @@
-"""Message authentication codes of the superframe.
+"""Message authentication codes of the superframe: four bytes of keyed BLAKE2s (RFC 7693, section 2.9) at a packet's end.
 
-Each packet ends with four bytes of keyed BLAKE2s (RFC 7693, section 2.9) over the content and over what makes the packet
-unique: sender, session, frame, and for a reply the beacon it replies to. A recorded packet is therefore valid at no
-other time. A code does not prove when a packet was sent; the time checks of the session reject delayed beacons.
+They cover the content, sender, session, frame, and for a reply the beacon it replies to, so a recorded packet is valid at
+no other time. They do not prove when a packet was sent; the time checks of the session reject delayed beacons.
 """
 
 from __future__ import annotations

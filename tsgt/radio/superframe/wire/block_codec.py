@@ -1,9 +1,8 @@
 """Measurement blocks as bit fields.
 
 Linear predictive coding: the newest measurement of a block is sent in full, each older one as its residual from a linear
-extrapolation of the two before it. At constant velocity a residual is little more than the instrument's noise. A residual
-takes the narrowest of four field widths that holds it; the last one holds any number. The widths were fitted to tracks
-of real and simulated robots at 10 to 500 m and up to 2 m/s.
+extrapolation of the two before it, in the narrowest of four field widths that holds it; the last one holds any number.
+The widths were fitted to tracks of real and simulated robots at 10 to 500 m and up to 2 m/s.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ VALUE_BITS = 24  # of an angle and of a distance; distance 0: none
 NOMINAL_STEP = 25_000
 """Predicted first time step, in units of 16 us: 0.4 s, the usual period of a tracking total station."""
 
-TIME_WIDTHS = (8, 12, 18, WIDE_TIME_BITS)
+TIME_WIDTHS = (8, 12, 18, WIDE_TIME_BITS)  # field widths of residuals in bits, two's complement, as below
 HORIZONTAL_WIDTHS = (7, 13, 17, VALUE_BITS)
 ZENITH_WIDTHS = (7, 11, 14, VALUE_BITS)
-DISTANCE_WIDTHS = (8, 11, 14, VALUE_BITS)  # field widths of residuals in bits, two's complement
+DISTANCE_WIDTHS = (8, 11, 14, VALUE_BITS)
 
 _QUALITY_BITS = 4
 _COUNT_BITS = 4

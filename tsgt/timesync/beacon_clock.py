@@ -22,14 +22,14 @@ MAX_SKEW_PPM = 120.0  # bound of the skew between two computers' clocks before i
 
 MAX_DEVIATION_US = 200.0  # a sample that deviates by more than this, and by more than the gate, is rejected
 
-_SKEW_SIGMA_PPM = 30.0
-_SLEWED_SIGMA_PPM = 200.0  # prior of the skew of a new clock, and of one that has just been slewed
+_SKEW_SIGMA_PPM = 30.0  # prior of the skew of a new clock,
+_SLEWED_SIGMA_PPM = 200.0  # and of one that has just been slewed
 
 _MIN_CANDIDATE_SAMPLES = 5
 """This many consecutive samples that agree with each other start a new segment against the current one."""
 
-MAX_SAMPLES = 10_000
-_DROPPED_SAMPLES = 1_000  # an hour and more at the usual rate, and how many are dropped at a time
+MAX_SAMPLES = 10_000  # an hour and more at the usual rate
+_DROPPED_SAMPLES = 1_000  # how many are dropped at a time
 
 _MAX_UNWRAP_BOUND_US = 30_000.0
 """The 16 low bits of a time are unambiguous within half of 2^16 us, less a margin for timestamps."""
@@ -60,10 +60,7 @@ class TimeEstimate(NamedTuple):
 
 
 class _Jitter:
-    """Scale of the timestamps' scatter over their claimed sigma, from each sample's deviation from its neighbours.
-
-    A running mean square with a prior and exponential forgetting; inflated while there are few samples.
-    """
+    """Scale of the scatter over the claimed sigma: a running mean square with a prior and exponential forgetting."""
 
     _MIN_SAMPLES = 8
     _SMALL_SAMPLE_INFLATION = 16
@@ -217,10 +214,7 @@ class BeaconClock:
         return self._at(local_ns) if self.initialised else None
 
     def elapsed(self, from_ns: int, to_ns: int) -> TimeEstimate:
-        """Return the duration on the master's clock between two instants of this computer's.
-
-        Before initialisation both clocks are taken to run alike, within the bound of their skew.
-        """
+        """Return the master's duration between two local instants; before initialisation within the skew's bound."""
         local_us = (to_ns - from_ns) / 1000
         if not self.initialised:
             return _duration(local_us, 0.0, _SKEW_SIGMA_PPM, MAX_SKEW_PPM)
@@ -299,12 +293,7 @@ class BeaconClock:
             self._candidate = None
 
     def _must_wait(self, sample: BeaconSample, segment: ClockSegment, *, live: bool) -> bool:
-        """Whether a consistent sample has to wait for others, because after an outage it may be a delayed one.
-
-        After an outage a clock may be off by more than :data:`MAX_DEVIATION_US`, and a single sample would decide. One
-        that is consistent with the waiting ones only because of another long gap does not count together with them, as
-        they may have been delayed; but they improve its skew.
-        """
+        """Whether a consistent sample waits for others: after an outage a single one may be delayed, and would decide."""
         waiting = self._candidate if self._candidate_consistent else None
         if waiting is not None and _is_near(waiting, sample):
             if len(waiting) + 1 >= _MIN_CANDIDATE_SAMPLES:

@@ -1,12 +1,8 @@
 """The model that the clock estimators share: a straight line of clock offset over time, with its covariance.
 
-Near an instant the offset of one clock from another is ``offset + skew * dt``. The skew is a random walk, so an estimate
-loses weight with age. :meth:`ClockLine.propagate` and :meth:`ClockLine.update` are the two steps of the Kalman filter
-for this model (Bar-Shalom, Li, Kirubarajan 2001, section 6.2: continuous white noise acceleration). The model is
-symmetric in time, so the filter also runs backwards; :meth:`ClockLine.fuse` combines a forward and a backward estimate
-(two-filter smoother: Fraser and Potter 1969).
-
-Offsets have any unit, and skews that unit per second: us and ppm, or ns and ns/s.
+The offset is ``offset + skew * dt``; the skew is a random walk, so an estimate loses weight with age. Kalman filter:
+Bar-Shalom, Li, Kirubarajan 2001, section 6.2, continuous white noise acceleration. It also runs backwards; forward and
+backward estimates are fused (two-filter smoother: Fraser and Potter 1969). Units: us and ppm, or ns and ns/s.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """A segment of time in which a clock's skew wanders but does not break: two Kalman filters over its samples.
 
-The *slow* filter assumes a skew as steady as that of crystals in the field, and gives the value. The *fast* filter trusts
-the skew for seconds only. It is noisier, but whatever a clock can do unnoticed stays within five of its standard errors:
-the truth is near the fast estimate, and the bound of the slow one is its distance from there. Where the two diverge the
-skew has changed, and the slow filter is reinitialised from the fast one.
+The *slow* filter assumes a steady skew, as of crystals in the field, and gives the value. The *fast* one trusts it for
+seconds only: the truth stays within five of its standard errors, and the slow one's bound is its distance from there.
+Where the two diverge the skew has changed, and the slow filter is reinitialised from the fast one.
 """
 
 from __future__ import annotations

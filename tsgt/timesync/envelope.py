@@ -1,10 +1,8 @@
 """The lower envelope of responses that are delayed at random, never early: its height, its slope, and their errors.
 
-Over instrument time the responses lie above a straight line, by anything from 0 to a spread. Given the slope, the line
-cannot be above the lowest response, and is probably less than spread / number of responses below it. With a steeper
-slope another response is the lowest, and on average the responses lie higher above the line: the more responses there
-are, the less likely is a slope that leaves room below them. The mean and the covariance of the line over all slopes,
-weighted by that likelihood and the prior, minimise the mean square error (Pitman 1939).
+The responses lie above a line by 0 to a spread. Given the slope, the line is not above the lowest response, and probably
+less than spread / number of responses below it; a slope that leaves room below many responses is unlikely. Mean and
+covariance over all slopes, weighted by that and the prior, minimise the mean square error (Pitman 1939).
 """
 
 from __future__ import annotations

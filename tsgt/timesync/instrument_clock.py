@@ -1,9 +1,8 @@
 """The instrument's own time on the host's clock, from the arrival of its responses.
 
-A response carries the instrument's time of a measurement, in ms since it was switched on. It arrives after a delay of
-instrument and serial line, which varies but is never less than a minimum. So, over instrument time, "arrival less
-instrument time" lies above a line, the lower envelope, whose height is the clock offset plus the minimum delay and whose
-slope is the skew. docs/explanation/instrument-time.md states the errors of the fit, and what is unobservable.
+A response carries a time in ms since the instrument was switched on, and arrives after a delay that varies above a minimum.
+So "arrival less instrument time" lies above a line, the lower envelope: its height is the clock offset plus the minimum
+delay, its slope the skew. docs/explanation/instrument-time.md states errors and what is unobservable.
 """
 
 from __future__ import annotations
@@ -53,10 +52,7 @@ _CANDIDATE_WINDOW = 32
 
 
 class HostTime(NamedTuple):
-    """An instant of the instrument on the host's CLOCK_MONOTONIC, plus the minimum delay.
-
-    The bound holds as long as the minimum delay stays the same.
-    """
+    """An instant on the host's CLOCK_MONOTONIC, plus the minimum delay, on whose constancy the bound depends."""
 
     host_ns: int
     sigma_ns: int
@@ -133,10 +129,7 @@ class InstrumentClock:
                 self._fit()
 
     def add(self, instrument_ms: int, arrived_ns: int) -> bool:
-        """Take a sample: an instrument time, and the arrival of the first byte of its response.
-
-        Returns False if the instrument's count has jumped; the fit is reset then.
-        """
+        """Take an instrument time and its first byte's arrival. Returns False if the count jumped; that resets the fit."""
         self._seen += 1
         self.inconsistent = False
         if not self.initialised:

@@ -20,8 +20,8 @@ _SIGMAS = 5.0
 _SIGMA_OF_MEDIAN = 1.0484
 """Sigma over the median of the absolute difference of two normally distributed values."""
 
-_PRIOR_JITTER_NS = 25_000.0
-_PRIOR_EXCHANGES = 2  # prior of an exchange's jitter, and how many exchanges it counts as
+_PRIOR_JITTER_NS = 25_000.0  # prior of an exchange's jitter
+_PRIOR_EXCHANGES = 2  # how many exchanges it counts as
 _MIN_EXCHANGES = 8  # with fewer exchanges the jitter is unknown, and no possible exchange is rejected
 
 _ANOMALY_NS = 50_000.0  # smallest deviation that is reported as an anomaly
@@ -82,10 +82,7 @@ class LinkDelayEstimator:
         return possible and consistent
 
     def _jitter_ns(self) -> float:
-        """Return one sigma of an exchange, from the differences of successive exchanges, rejected ones included.
-
-        Coarse timestamps have to widen the gate; a delay that all exchanges share must not.
-        """
+        """Return one sigma of an exchange, from the differences of successive ones, rejected ones included."""
         count = len(self._differences_ns)
         sigma_ns = _SIGMA_OF_MEDIAN * median(self._differences_ns) if count else 0.0
         square = pooled_variance(

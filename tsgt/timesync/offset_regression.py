@@ -56,8 +56,7 @@ class Batch:
     """The selected exchanges of one synchronisation: an entry each, at least one, in the order of time."""
 
     station_ns: Int64s
-    offset_ns: Int64s
-    """See :attr:`~tsgt.model.ClockSample.max_offset_ns`."""
+    offset_ns: Int64s  # see :attr:`~tsgt.model.ClockSample.max_offset_ns`
     excess_ns: Int64s
 
     @property
@@ -78,20 +77,14 @@ class SkewPrior:
 class RegressionLine:
     """Offset over station time, with its bound."""
 
-    origin_ns: int
-    """Station time of the last exchange."""
-    base_ns: int
-    """Offset to which the line's is added; offsets of whole years do not fit into a float."""
-    line: ClockLine
-    """At the origin, in ns and ns/s."""
-    since_s: float
-    until_s: float
-    """The span of the confirmed synchronisations; not above zero."""
+    origin_ns: int  # station time of the last exchange
+    base_ns: int  # offset to which the line's is added; offsets of whole years do not fit into a float
+    line: ClockLine  # at the origin, in ns and ns/s
+    since_s: float  # start of the span of the confirmed synchronisations; not above zero
+    until_s: float  # its end; not above zero
     min_excess_ns: float
-    gap_s: float
-    """How long the skew may have changed unobserved at the end of the span."""
-    noise_ns: float
-    """Scatter of the timestamps within a synchronisation, one sigma."""
+    gap_s: float  # how long the skew may have changed unobserved at the end of the span
+    noise_ns: float  # scatter of the timestamps within a synchronisation, one sigma
     skew_error: float
     """Prediction error of the last synchronisation by the line before it, over the gap, in ns/s; not negative."""
 

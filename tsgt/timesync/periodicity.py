@@ -1,8 +1,7 @@
 """Period and phase of an instrument's continuous measurement, from the timestamps of its measurements.
 
-Measurements get lost, arrive late and out of order, and some instruments jitter by a few milliseconds. So a rough period
-from the shorter intervals numbers the measurements, and least squares fits period and phase, once with all of them and
-once without outliers.
+Some get lost, late, out of order, or jitter by milliseconds: a rough period from the shorter intervals numbers them, and
+least squares fits period and phase, once with all and once without outliers.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """A station's clock against the master's, from two-way exchanges.
 
-A clock offset is positive when the station's clock is ahead of the master's: a station timestamp less the offset is the
-time on the master's clock. docs/explanation/clock-offset.md explains both filters and what is unobservable.
-
-Each exchange bounds the offset from both sides: the station cannot have timestamped the request before it arrived
-(:attr:`~tsgt.model.ClockSample.max_offset_ns`), nor after it replied (:attr:`~tsgt.model.ClockSample.min_offset_ns`).
+A positive offset means that the station's clock is ahead: a station timestamp less the offset is the master's time. An
+exchange bounds it from both sides: the request cannot be timestamped before it arrived, nor after the reply
+(:class:`~tsgt.model.ClockSample`). docs/explanation/clock-offset.md explains both filters and what is unobservable.
 """
 
 from __future__ import annotations
@@ -79,17 +77,11 @@ class ClockFilter(Protocol):
     name: str
 
     def update(self, samples: Sequence[ClockSample], *, may_have_restarted: bool = False) -> FilterUpdate:
-        """Take the exchanges of one synchronisation, at least one, in the order of time.
-
-        The station's program ``may_have_restarted`` since the last synchronisation, with another clock.
-        """
+        """Take one synchronisation's exchanges in order; ``may_have_restarted``: the station may have another clock."""
         ...
 
     def at(self, station_ns: int) -> ClockEstimate:
-        """Return the offset when the station's clock shows the given time in ns.
-
-        Raises LookupError if there was no synchronisation since the start or the last reset.
-        """
+        """Return the offset at a time of the station's clock; raises LookupError without a synchronisation."""
         ...
 
     def reset(self) -> None:
@@ -105,10 +97,7 @@ def clock_filter(name: Literal["regression", "paper"]) -> ClockFilter:
 def interpolate(
     before: ClockEstimate, before_ns: int, after: ClockEstimate, after_ns: int, station_ns: int
 ) -> ClockEstimate:
-    """Return the offset on the straight line between two estimates, bounded by the wander of the skew in between.
-
-    The estimates are those at the station times ``before_ns`` and ``after_ns``; ``station_ns`` lies in between.
-    """
+    """Return the offset on the line between two estimates and their station times, bounded by the skew's wander."""
     since_ns, until_ns = station_ns - before_ns, after_ns - station_ns
     share = since_ns / (since_ns + until_ns)
     wander_ns = interpolation_wander_ns(since_ns / 1e9, until_ns / 1e9)

@@ -65,18 +65,14 @@ log = structlog.get_logger()
 class MasterDependencies:
     """What the master needs besides its configuration."""
 
-    open_radio: RadioOpener
-    """Opens the radio; called again after each failure."""
-    clock: Clock
-    """The radio's."""
-    key: bytes | None = None
-    """Content of ``protocol.key_file``; None: the radio is not authenticated."""
+    open_radio: RadioOpener  # opens the radio; called again after each failure
+    clock: Clock  # the radio's
+    key: bytes | None = None  # content of ``protocol.key_file``; None: the radio is not authenticated
     random_bits: Callable[[int], int] = secrets.randbits
     """Returns a random number of this many bits, for nonces."""
     observe: Callable[[object, bytes], None] = lambda _record, _line: None
     """Called with each published record and its line."""
-    write: Callable[[int, memoryview], int] | None = None
-    """See :class:`~tsgt.recording.RecordingWriter`."""
+    write: Callable[[int, memoryview], int] | None = None  # see :class:`~tsgt.recording.RecordingWriter`
 
 
 async def run_master(

@@ -1,12 +1,8 @@
 """Live alarm for a layout that no longer fits: a tripod has moved, or a prism has slipped on the robot. Sans-I/O.
 
-The sign is that the prisms miss their layout by more than noise and interpolation explain, and persistently. A single pose
-proves little: the prisms of a moving robot are measured at different instants and interpolated, which now and then
-distorts their triangle. A wrong frame distorts it always. So three of four poses over some seconds have to exceed the
-limit, and the limit grows with speed.
-
-What does not distort the triangle can not be seen: with three prisms a movement across their plane, and stations that moved
-as one. docs/how-to/calibrate.md has the figures.
+A wrong frame distorts the prisms' triangle always, interpolation of a moving robot's only now and then. So three of four
+poses over some seconds have to exceed the limit, which grows with speed. Unobservable: with three prisms a movement across
+their plane, and stations that moved as one. docs/how-to/calibrate.md has the figures.
 """
 
 from __future__ import annotations

@@ -63,8 +63,7 @@ class _Station:
 
     prism: int
     newest_ns: int = 0
-    lost_ns: int | None = None
-    """When its instrument lost the prism; None while it has it."""
+    lost_ns: int | None = None  # when its instrument lost the prism; None while it has it
     second_face: bool = False
     points: deque[PolarMeasurement] = field(default_factory=lambda: deque(maxlen=POINT_HISTORY_CAPACITY))
     hint: Direction | None = None
@@ -103,10 +102,7 @@ class ReacquisitionHints:
             station.lost_ns = max(station.lost_ns, at_ns)
 
     def direction(self, number: int, now_ns: int) -> Direction | None:
-        """Return where a station should search for its prism now; None: no hint.
-
-        The same object is returned for 5 s; another one is a new command. ``now_ns`` is on the master's Unix clock.
-        """
+        """Return where to search, the same object for 5 s (another is a new command); None: no hint. Master's Unix clock."""
         station = self._stations[number]
         if station.lost_ns is None or now_ns - station.lost_ns <= HINT_DELAY_NS:
             return None

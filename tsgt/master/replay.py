@@ -101,10 +101,7 @@ def _arrival(
 async def replay(
     arrivals: Iterator[tuple[int, list[bytes]]], server: StreamServer, clock: Clock, *, speed: float
 ) -> int:
-    """Publish replayed arrivals, waiting for slow readers; return the number of lines.
-
-    A speed of 1 is real time, infinity as fast as the readers can take.
-    """
+    """Publish arrivals, waiting for slow readers; return the number of lines. Speed 1: real time, infinity: fastest."""
     lines_published = 0
     start_ns: int | None = None
     replay_start_ns = clock.monotonic_ns()

@@ -47,15 +47,11 @@ class _Station:
     """First reply without a new measurement; None while there are new ones."""
     idle: bool = False
     meaning: str = _MEANING[Status.OK]
-    newest: tuple[int, int] = (-1, 0)
-    """Sequence number and stamp of the newest measurement."""
+    newest: tuple[int, int] = (-1, 0)  # sequence number and stamp of the newest measurement
 
 
 class StationEventDetector:
-    """Turns changes of the stations' states into events, one per change.
-
-    ``now_ns``: the present on the master's Unix clock in ns, like all instants here.
-    """
+    """Turns changes of the stations' states into events; instants are on the master's Unix clock in ns."""
 
     def __init__(self, stations: Iterable[int], now_ns: int) -> None:
         self._stations = {station: _Station(now_ns) for station in stations}

@@ -1,11 +1,8 @@
-"""Stream server: JSON lines on a UNIX socket, to any number of readers.
+"""Stream server: JSON lines on a UNIX socket, to any number of readers. docs/reference/stream.md describes them.
 
-Problem: a reader that stalls must not cost the others or the master anything, and must know that it has lost lines. Idea:
-the kernel and the transport buffer what they can; behind them each reader has a queue, which drops its oldest line when it
-is full. The reader then gets an event ``lines_lost`` with their number in their place. The lines are described in
-docs/reference/stream.md.
-
-There are no tasks: lines are sent from :meth:`StreamServer.publish` and from the event loop's callbacks.
+A reader that stalls must cost the others nothing, and know that it has lost lines: behind the buffers of kernel and
+transport each has a queue, which drops its oldest line when full, and the reader gets an event ``lines_lost`` with the
+number. There are no tasks: lines are sent from :meth:`StreamServer.publish` and the event loop's callbacks.
 """
 
 from __future__ import annotations

@@ -47,15 +47,12 @@ DUPLICATE_WINDOW = 1000  # the last measurements among which a repeated or repla
 class ClockState(Enum):
     """What is known of a station's clock."""
 
-    UNSYNCHRONISED = auto()
-    """No offset is known; measurements are held."""
-    SYNCHRONISED = auto()
-    """Measurements are converted with the known offset."""
+    UNSYNCHRONISED = auto()  # no offset is known; measurements are held
+    SYNCHRONISED = auto()  # measurements are converted with the known offset
     AWAITING_MEASUREMENT = auto()
     """Synchronised, but the station has reported that it has not measured yet. It may have restarted before its first
     measurement, so that one needs a synchronisation."""
-    SUSPENDED = auto()
-    """The station may have another clock than the synchronised one; measurements are held."""
+    SUSPENDED = auto()  # the station may have another clock than the synchronised one; measurements are held
 
     @property
     def holds(self) -> bool:
@@ -94,10 +91,8 @@ def next_clock_state(state: ClockState, event: ClockEvent) -> ClockState:
 class PollResult(NamedTuple):
     """The result of a poll."""
 
-    measurement: PolarMeasurement | None = None
-    """None where there is nothing new, or it is held."""
-    stepped: bool = False
-    """The station's clock was just found to have been stepped or reset."""
+    measurement: PolarMeasurement | None = None  # None where there is nothing new, or it is held
+    stepped: bool = False  # the station's clock was just found to have been stepped or reset
     needs_synchronisation: bool = False
     """The station has to be synchronised before its measurements can be used: its clock stepped, it was silent, it may
     have restarted, or a measurement appears old."""
@@ -109,8 +104,7 @@ class SynchronisationResult(NamedTuple):
     record: ClockRecord
     measurements: list[PolarMeasurement]
     """Those that were held and belong to this clock, in the order of their arrival."""
-    stepped: bool
-    """The station's clock was just found to have been stepped or reset."""
+    stepped: bool  # the station's clock was just found to have been stepped or reset
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,10 +210,7 @@ class StationIngest:
         self._held.append((message, received_ns))
 
     def _no_measurement_yet(self, *, unnoticed_restart: bool) -> bool:
-        """Return whether a station without a measurement has restarted.
-
-        It has if there was a measurement before, and may have if a request was lost, or if it was not polled for long.
-        """
+        """Return whether a station that has no measurement yet has restarted, or may have, unnoticed."""
         restarted, self._last = unnoticed_restart or self._last is not None, None
         if restarted:
             self.suspend()
@@ -227,10 +218,7 @@ class StationIngest:
         return restarted
 
     def _end_silence(self, received_ns: int) -> bool:
-        """Return whether this is the first reply after a silence in which the station may have got another clock.
-
-        Its time alone then proves nothing: a clock that was stopped meanwhile makes a new measurement look old.
-        """
+        """Return whether this ends a silence in which the station may have got another clock: its time proves nothing."""
         silent = (
             self._unanswered
             and self._received_ns is not None
@@ -316,11 +304,7 @@ class StationIngest:
         present: ClockEstimate | None,
         earlier_ns: int | None,
     ) -> PolarMeasurement | None:
-        """Stamp a held measurement, if it can be of the synchronised clock.
-
-        ``earlier_ns`` is the offset before the synchronisation, where the measurement may be of that clock: a step may
-        be too small to show in the samples.
-        """
+        """Stamp a held measurement unless it may be of the clock whose offset was ``earlier_ns``: steps may be small."""
         if present is not None:
             stamp_ns = message.time_ns - present.offset_ns
             if received_ns - 2 * STALE_THRESHOLD_NS <= stamp_ns <= received_ns + present.bound_ns:

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 
 
 class ClassicLink:
-    """Runs transactions with the stations and reports the results.
-
-    ``exchange_start_ns``: when the present transaction began, on the master's Unix clock; None without a radio.
-    """
+    """Runs transactions and reports results; ``exchange_start_ns``: when the present one began, None without radio."""
 
     def __init__(
         self,
@@ -137,11 +134,7 @@ class ClassicLink:
 
 
 def _is_inconclusive(transaction: Synchronisation) -> bool:
-    """Whether the station may have another clock than that of the samples.
-
-    A restarted station reports it until its first ping. If that ping was part of this synchronisation and its reply
-    was lost, nothing else reports the restart. A station that restarted here may also track another prism.
-    """
+    """Whether the station may have restarted, and have another clock than the samples', without a report of it."""
     return transaction.restarted or (
         transaction.missed_replies > 0
         and (not transaction.samples or transaction.longest_silence_ns > MIN_RESTART_NS)

@@ -1,13 +1,9 @@
 """Schedules the transactions of the classic protocol on its one channel. Sans-I/O.
 
-Problem: all stations share the channel, and a station that does not respond costs the others a whole time-out. Idea:
-round robin; each station gets the one transaction that it needs most. A fruitless transaction is followed by a back-off
-of a multiple of its duration, so that a dead station costs the others a twentieth of their time. The first fruitless
-poll is repeated at once: most often a single packet was lost.
-
-A station is commanded to track its prism, then synchronised, then polled. Polls continue while it is silent: they are the
-cheapest way to notice that it has recovered. A poll and the command to measure a target begin with the same letter, so
-a station that has not confirmed that it tracks is never polled.
+Round robin: each station gets the one transaction it needs most. A back-off of a multiple of its duration follows a
+fruitless one; only the first fruitless poll is repeated at once. A station is commanded to track, synchronised, then
+polled, even while silent, which is the cheapest way to notice its recovery. As a poll and the command to measure a target begin with the same
+letter, a station that has not confirmed that it tracks is never polled.
 """
 
 from __future__ import annotations
@@ -56,20 +52,16 @@ class StationPlan:
 
     station: int
     prism: int
-    stamp_delay_ns: int = 0
-    """By how much its computer's reception stamps are late, in ns."""
+    stamp_delay_ns: int = 0  # by how much its computer's reception stamps are late, in ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SynchronisationSchedule:
     """How often clocks are synchronised."""
 
-    initial_cycles: int
-    """Cycles of a station's first synchronisation, at the start."""
-    resync_cycles: int
-    """Cycles of every other one."""
-    interval_ns: int
-    """Between synchronisations of a station, in ns. Stations are staggered evenly over it."""
+    initial_cycles: int  # cycles of a station's first synchronisation, at the start
+    resync_cycles: int  # cycles of every other one
+    interval_ns: int  # between synchronisations of a station, in ns. Stations are staggered evenly over it.
     first_interval_ns: int = FIRST_INTERVAL_NS
     """From the first to the second; it triples until it reaches ``interval_ns``."""
 
@@ -80,10 +72,7 @@ class SynchronisationSchedule:
 
 
 class Scheduler:
-    """Chooses transactions, one at a time.
-
-    ``stations``: in the order of the round. ``start_ns``: the present; like all instants here on any one clock in ns.
-    """
+    """Chooses transactions, one at a time, with ``stations`` in the order of the round; instants on any one clock."""
 
     def __init__(
         self,
@@ -240,13 +229,10 @@ class _Station:
     """State of one station."""
 
     plan: StationPlan
-    tracks: bool = False
-    """It has confirmed that it tracks."""
-    silent: bool = False
-    silent_since_ns: int | None = None
-    """It did not respond to the last request; since when, None: it did."""
-    confirmed: bool = False
-    """It confirmed in response to the last command; see ``tracks``."""
+    tracks: bool = False  # it has confirmed that it tracks
+    silent: bool = False  # it did not respond to the last request
+    silent_since_ns: int | None = None  # since when; None: it responded
+    confirmed: bool = False  # it confirmed in response to the last command; see ``tracks``
     may_respond_until_ns: int = 0
     """Until then its response to a command may still arrive, in a transaction of another station."""
     fruitless: int = 0
@@ -254,12 +240,8 @@ class _Station:
     unanswered: int = 0
     """Consecutive polls and synchronisations without a result; commands refused since one was executed, and consecutive
     commands without a response."""
-    inconclusive: int = 0
-    """Consecutive synchronisations that may have been of an earlier clock."""
-    synchronisations: int = 0
-    """Since the station was first received or its clock was reset."""
-    due_ns: int = 0
-    urgent: bool = False
-    """When the next one is due, and whether before anything else."""
-    not_before_ns: int = 0
-    """End of the back-off."""
+    inconclusive: int = 0  # consecutive synchronisations that may have been of an earlier clock
+    synchronisations: int = 0  # since the station was first received or its clock was reset
+    due_ns: int = 0  # when the next one is due
+    urgent: bool = False  # whether it is due before anything else
+    not_before_ns: int = 0  # end of the back-off

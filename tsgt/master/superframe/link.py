@@ -43,10 +43,7 @@ class _Unwritten(NamedTuple):
 
 
 class SuperframeLink:
-    """Runs frames and reports the results.
-
-    ``exchange_start_ns``: when the present frame began, on the master's Unix clock; None without a radio.
-    """
+    """Runs frames and reports results; ``exchange_start_ns``: when the present one began, None without a radio."""
 
     def __init__(
         self,

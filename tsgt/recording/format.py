@@ -94,10 +94,7 @@ def encode_line(record: object) -> bytes:
 
 
 def decode(cls: type[T], data: bytes) -> T:
-    """Build a record from one JSON object; unknown keys are ignored.
-
-    Raises ValueError if it is not JSON, or names the first field that is missing or wrong, in one line.
-    """
+    """Build a record, ignoring unknown keys; ValueError names the first missing or wrong field in one line."""
     try:
         record: T = _validator(cls).validate_json(data, strict=True)
     except ValidationError as error:
@@ -108,10 +105,7 @@ def decode(cls: type[T], data: bytes) -> T:
 
 
 def decode_line(cls: type[T], line: Line, path: Path) -> T:
-    """Build a record from a line of a recording.
-
-    Raises CorruptLineError, which names the line and the first field that is missing or wrong.
-    """
+    """Build a record from a line; CorruptLineError names line and first missing or wrong field."""
     try:
         return decode(cls, line.data)
     except ValueError as error:

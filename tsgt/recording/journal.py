@@ -143,10 +143,7 @@ class Journal:
 
 
 def is_unfinished_journal(path: Path) -> bool:
-    """Return whether the client ended before the first lines were complete: the file is empty or ends in its head.
-
-    Raises RecordingError if the file cannot be read.
-    """
+    """Return whether the client ended before the first lines were complete. Raises RecordingError if unreadable."""
     try:
         with path.open("rb") as file:
             first, second = (file.readline(MAX_LINE_BYTES) for _ in range(2))

@@ -32,12 +32,9 @@ _MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, 
 class Recording:
     """The content of a recording that post-processing needs."""
 
-    header: RecordingHeader
-    """Of the first session."""
-    parameters: Parameters
-    """The last ones in the file."""
-    measurements: list[Measurement]
-    """In the order of arrival, with merged ones at their place in the file."""
+    header: RecordingHeader  # of the first session
+    parameters: Parameters  # the last ones in the file
+    measurements: list[Measurement]  # in the order of arrival, with merged ones at their place in the file
     end_ns: int | None
     """Latest arrival, status or event in the file, on the master's Unix clock in ns; None without any."""
 

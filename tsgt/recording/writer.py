@@ -93,10 +93,7 @@ class RecordingWriter:
         return size - whole_bytes
 
     def write(self, record: object) -> None:
-        """Append a record as one line.
-
-        Raises RecordingError if the line could not be written, and no part of it was. Later lines may succeed.
-        """
+        """Append a record as one line. Raises RecordingError if no part of it could be written; later ones may be."""
         self.write_line(encode_line(record))
 
     def write_line(self, line: bytes) -> None:
@@ -132,10 +129,7 @@ class RecordingWriter:
             self._torn_at = None
 
     def sync(self) -> None:
-        """Bring all lines written so far to the disk; may run in another thread.
-
-        Raises RecordingError if the disk failed; lines since the last successful sync may be lost.
-        """
+        """Bring all lines to the disk, in any thread. Raises RecordingError: those since the last sync may be lost."""
         with self._sync_lock:
             if not self._unsynced:
                 return

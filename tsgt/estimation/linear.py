@@ -1,12 +1,9 @@
 """The estimator ``linear``, live and for post-processing. Sans-I/O.
 
-Epochs are the whole multiples of a period in Unix time. An epoch is *decided* as soon as each prism either has a
-measurement at or after it, or can no longer get a useful one: everything made before now minus the transport limit has
-arrived, and the prism's last measurement is older than the outage limit. A measurement after a gap in its station's
-sequence numbers counts when the gap is closed or the transport limit has passed. All stations that track a prism
-contribute. A decided epoch gets its pose at once; what is decided does not depend on when the estimator is asked, so a replay
-gives the same poses. Live, a measurement that arrives after the transport limit may come too late;
-:mod:`tsgt.analysis` adds all measurements in the order of time and loses none.
+Epochs are the multiples of a period in Unix time, *decided* when each prism has a measurement at or after it or can get no
+useful one any more: all made before now minus the transport limit have arrived, and its last one is older than the outage
+limit. A measurement after a gap in the sequence numbers counts when that is closed or past the transport limit. What is
+decided does not depend on when the estimator is asked: a replay gives the same poses.
 """
 
 from __future__ import annotations

@@ -57,32 +57,21 @@ class Kind(IntEnum):
 class PoseBatch:
     """Poses at N epochs from P prisms, as arrays; NaN where a pose was not computed."""
 
-    stamp_ns: NDArray[np.int64]
-    """(N,) epochs on the master's Unix clock."""
-    kind: NDArray[np.int8]
-    """(N,) values of :class:`Kind`."""
-    reason: NDArray[np.int8]
-    """(N,) values of :class:`Reason`."""
-    position_m: NDArray[np.float64]
-    orientation_xyzw: NDArray[np.float64]
-    """(N, 3) and (N, 4): the robot frame in the frame ``station1``."""
+    stamp_ns: NDArray[np.int64]  # (N,) epochs on the master's Unix clock
+    kind: NDArray[np.int8]  # (N,) values of :class:`Kind`
+    reason: NDArray[np.int8]  # (N,) values of :class:`Reason`
+    position_m: NDArray[np.float64]  # (N, 3) origin of the robot frame in the frame ``station1``
+    orientation_xyzw: NDArray[np.float64]  # (N, 4) of the robot frame in the frame ``station1``
     covariance: NDArray[np.float64]
     """(N, 6, 6): x, y, z, rotations about the fixed axes x, y, z, in the frame ``station1``, in m and rad."""
-    velocity_mps: NDArray[np.float64]
-    angular_velocity_radps: NDArray[np.float64]
-    """(N, 3) each: of the robot's origin in ``station1``, and in the robot frame."""
-    residual_m: NDArray[np.float64]
-    """(N,) root mean square of the prisms' distances from the fitted layout."""
-    station: NDArray[np.int64]
-    """(N, P) the station that last measured each prism."""
-    age_s: NDArray[np.float64]
-    """(N, P) age of that measurement at the epoch; NaN where there was none."""
-    prism_residual_m: NDArray[np.float64]
-    """(N, P) distance of each prism from the fitted layout."""
-    prism_reason: NDArray[np.int8]
-    """(N, P) values of :class:`Reason` per prism."""
-    prisms: tuple[int, ...]
-    """Numbers of the prisms, the order of the columns."""
+    velocity_mps: NDArray[np.float64]  # (N, 3) of the robot's origin, in ``station1``
+    angular_velocity_radps: NDArray[np.float64]  # (N, 3) in the robot frame
+    residual_m: NDArray[np.float64]  # (N,) root mean square of the prisms' distances from the fitted layout
+    station: NDArray[np.int64]  # (N, P) the station that last measured each prism
+    age_s: NDArray[np.float64]  # (N, P) age of that measurement at the epoch; NaN where there was none
+    prism_residual_m: NDArray[np.float64]  # (N, P) distance of each prism from the fitted layout
+    prism_reason: NDArray[np.int8]  # (N, P) values of :class:`Reason` per prism
+    prisms: tuple[int, ...]  # numbers of the prisms, the order of the columns
 
     @classmethod
     def blank(

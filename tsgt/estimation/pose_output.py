@@ -41,16 +41,11 @@ class PrismHistory(NamedTuple):
 class MeasurementHistory:
     """The measurements that a trajectory is based on."""
 
-    times_ns: NDArray[np.int64]
-    """(M,) instants of the usable ones in their order, on the master's Unix clock."""
-    stations: NDArray[np.int64]
-    """(M,) numbers of their stations."""
-    prisms: NDArray[np.intp]
-    """(M,) their prisms as columns of the layout."""
-    residuals_m: NDArray[np.float64]
-    """(M,) their distances from the trajectory; NaN where unknown."""
-    unusable_ns: Sequence[NDArray[np.int64]]
-    """By column, the instants of the unusable ones, in their order."""
+    times_ns: NDArray[np.int64]  # (M,) instants of the usable ones in their order, on the master's Unix clock
+    stations: NDArray[np.int64]  # (M,) numbers of their stations
+    prisms: NDArray[np.intp]  # (M,) their prisms as columns of the layout
+    residuals_m: NDArray[np.float64]  # (M,) their distances from the trajectory; NaN where unknown
+    unusable_ns: Sequence[NDArray[np.int64]]  # by column, the instants of the unusable ones, in their order
 
     @cached_property
     def by_prism(self) -> list[PrismHistory]:
@@ -90,10 +85,7 @@ class ContinuousPoseOutput:
         *,
         converged: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
-        """Return poses from measurements before their epochs; arguments and result as for :meth:`smoothed`.
-
-        Live, there is one epoch at a time: looking up the latest measurement without arrays is faster.
-        """
+        """Return poses from earlier measurements, as :meth:`smoothed`; live a single epoch is looked up without arrays."""
         batch = PoseBatch.blank(np.array(stamps_ns, dtype=np.int64), self._prisms, Kind.PREDICTED)
         for row, stamp_ns in enumerate(stamps_ns):
             for column, home_station in enumerate(self._home_station):

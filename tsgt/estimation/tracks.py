@@ -33,14 +33,11 @@ class Track:
 
     times_ns: NDArray[np.int64]
     """(M,) instants of measurement on the master's Unix clock, strictly increasing."""
-    points_m: NDArray[np.float64]
-    """(M, 3) positions in the frame ``station1``."""
+    points_m: NDArray[np.float64]  # (M, 3) positions in the frame ``station1``
     covariances_m2: NDArray[np.float64]
     """(M, 3, 3) their covariances in the same frame, from the instrument's noise."""
-    time_sigmas_ns: NDArray[np.int64]
-    """(M,) one sigma of the instants."""
-    stations: NDArray[np.int64]
-    """(M,) number of the station that measured."""
+    time_sigmas_ns: NDArray[np.int64]  # (M,) one sigma of the instants
+    stations: NDArray[np.int64]  # (M,) number of the station that measured
 
     @classmethod
     def empty(cls) -> Track:

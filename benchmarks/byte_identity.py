@@ -8,7 +8,7 @@ A refactoring must not change behaviour: the same seeds give the same recordings
 
 `collect` runs fourteen missions (both protocols, both estimators, faults on and off) and processes and evaluates both
 segments of published field data, if they are there. `compare` translates the old names and compares the rest exactly.
-Two things are left out: the wording of messages, and how long a command took.
+Left out are the wording of messages, how long a command took, and when a file was made.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ OLD_NAMES = {
 """Keys and event names that were renamed, old to new."""
 
 VOLATILE = re.compile(
-    rb'"(?:message|detail|note|wall_seconds|seconds|recording|output|version)": ?(?:"(?:[^"\\]|\\.)*"|[-0-9.e]+|null)'
+    rb'"(?:message|detail|note|wall_seconds|seconds|created_ns|recording|output|version)": ?(?:"(?:[^"\\]|\\.)*"|[-0-9.e]+|null)'
 )
 
 
@@ -168,6 +168,9 @@ def canonical(path: Path, names: dict[str, str]) -> list[bytes]:
     text = path.read_bytes()
     if path.suffix == ".tum":
         return text.splitlines()
+    if names:
+        for new, old in OLD_OPTIONS.items():
+            text = text.replace(f" {old} ".encode(), f" {new} ".encode())
     for old, new in names.items():
         text = text.replace(f'"{old}"'.encode(), f'"{new}"'.encode())
     return [VOLATILE.sub(b"", line) for line in text.splitlines()]

@@ -244,7 +244,7 @@ def test_line_break_in_a_file_name_is_escaped(tsgt: Tsgt, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("command", "example", "section"),
-    [("targets", 0, "Where the stations"), ("prisms", 2, "Where the prisms")],
+    [("targets", 0, "## Station frames"), ("prisms", 2, "## Prism layout")],
 )
 def test_every_json_key_is_documented(
     tsgt: Tsgt, tmp_path: Path, command: str, example: int, section: str

@@ -5,26 +5,19 @@ verdicts, sections, page and numbers. matplotlib and jinja2 are imported when a 
 """
 
 from tsgt.analysis.report.findings import Findings, collect_findings
-from tsgt.analysis.report.log import read_log
-from tsgt.analysis.report.motion import distance_error_series
 from tsgt.analysis.report.numbers import report_numbers
 from tsgt.analysis.report.page import render_page
 from tsgt.analysis.report.sections import sections, summary_table
-from tsgt.analysis.report.stations import StationRecord, station_records, station_statistics
-from tsgt.analysis.report.verdicts import Verdict, verdicts
+from tsgt.analysis.report.stations import StationRecord
+from tsgt.analysis.report.verdicts import verdicts
 
 __all__ = [
     "Findings",
     "StationRecord",
-    "Verdict",
     "collect_findings",
-    "distance_error_series",
-    "read_log",
     "render_page",
     "report_numbers",
     "sections",
-    "station_records",
-    "station_statistics",
     "summary_table",
     "verdicts",
 ]

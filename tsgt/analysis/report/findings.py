@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -109,20 +109,20 @@ class Findings:
     station_statistics: dict[int, StationStatistics]
     inter_prism: InterPrismDistances | None
     distance_errors: DistanceErrorSeries | None
-    odometry_stationary_ns: tuple[tuple[int, int], ...] | None
+    odometry_stationary_ns: tuple[tuple[int, int], ...] | None = None
     continuous: SmoothedRecording | None
-    linear: PoseBatch | None
-    difference: Difference | None
-    held_out: dict[Estimator, HeldOutErrors] | None
+    linear: PoseBatch | None = None
+    difference: Difference | None = None
+    held_out: dict[Estimator, HeldOutErrors] | None = None
     residuals: dict[int, dict[str, ResidualStatistics]]
     outliers: list[Outlier]
-    normalised: FloatArray
+    normalised: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     reference_errors: dict[Estimator, PoseErrorStatistics]
-    aligned_errors: dict[Estimator, AlignedErrorStatistics]
-    stationary_errors: dict[Estimator, StationaryStatistics]
-    reference: Reference | None
-    pose_noise: PoseNoise | None
-    problems: dict[str, str]
+    aligned_errors: dict[Estimator, AlignedErrorStatistics] = field(default_factory=dict)
+    stationary_errors: dict[Estimator, StationaryStatistics] = field(default_factory=dict)
+    reference: Reference | None = None
+    pose_noise: PoseNoise | None = None
+    problems: dict[str, str] = field(default_factory=dict)
 
     @property
     def poses(self) -> PoseBatch | None:

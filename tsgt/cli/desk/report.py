@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
 from tsgt.analysis.evaluation import distances_at_epochs, outliers, residual_statistics
 from tsgt.analysis.formats import read_stationary_intervals
@@ -64,20 +63,10 @@ def assess(
         },
         inter_prism=distances,
         distance_errors=distance_error_series(parameters, epochs, continuous.poses),
-        odometry_stationary_ns=None,
         continuous=continuous,
-        linear=None,
-        difference=None,
-        held_out=None,
         residuals=residual_statistics(continuous.fit, continuous.sources),
         outliers=outliers(continuous.fit, continuous.sources),
-        normalised=np.empty((0, 3)),
         reference_errors=compared,
-        aligned_errors={},
-        stationary_errors={},
-        reference=None,
-        pose_noise=None,
-        problems={},
     )
     return verdicts(findings)
 

@@ -17,6 +17,7 @@ from tsgt.config.client import (
     TemperatureC,
 )
 from tsgt.config.files import (
+    KINDS,
     find_problems,
     json_schema,
     load,
@@ -26,7 +27,6 @@ from tsgt.config.files import (
     load_station_latencies,
     load_target_residuals,
 )
-from tsgt.config.kinds import KINDS
 from tsgt.config.master import (
     FrameWatchConfig,
     GeofenceConfig,

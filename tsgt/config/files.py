@@ -5,12 +5,14 @@ from __future__ import annotations
 import difflib
 import json
 import tomllib
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from tsgt.config.base import Model
-from tsgt.config.kinds import KINDS, Config
+from tsgt.config.client import ClientConfig
+from tsgt.config.master import MasterConfig
+from tsgt.config.scenario import ScenarioConfig
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 from tsgt.errors import ConfigError
 from tsgt.model import TargetResidual
@@ -21,6 +23,20 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
     from tsgt.model import Matrix4, Vector3
+
+Config = Annotated[
+    ClientConfig | MasterConfig | StationFramesFile | PrismLayoutFile | ScenarioConfig,
+    Field(discriminator="kind"),
+]
+
+# All kinds of files, by the value of their top-level key ``kind``.
+KINDS: dict[str, type[Model]] = {
+    "client": ClientConfig,
+    "master": MasterConfig,
+    "station_frames": StationFramesFile,
+    "prism_layout": PrismLayoutFile,
+    "scenario": ScenarioConfig,
+}
 
 M = TypeVar("M", bound=Model)
 

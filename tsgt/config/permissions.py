@@ -1,4 +1,4 @@
-"""Permissions of the files that daemons read: whoever can change them can run programs as the daemon or move every pose.
+"""Permissions of the files that daemons read: write access to them means running any program as the daemon, or moving every pose.
 
 Files that everybody can change, directly or through a parent folder, are rejected; group-writable ones are not: on Debian
 each user has a group of their own and the umask is 002. Keys: see :mod:`tsgt.radio.key_file`.

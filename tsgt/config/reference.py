@@ -6,8 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tsgt.config.files import json_schema
-from tsgt.config.kinds import KINDS
+from tsgt.config.files import KINDS, json_schema
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,6 +1,6 @@
-"""Follow the robot's pose: a reader of the stream that needs nothing but Python's standard library.
+"""Print the poses of the stream, with Python's standard library only.
 
-Usage: ``python follow_stream.py [/run/tsgt/poses.sock]``. What each field means stands in docs/reference/stream.md.
+Usage: ``python follow_stream.py [/run/tsgt/poses.sock]``. The fields are documented in docs/reference/stream.md.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ def follow(path: str) -> None:
         for line in connection.makefile("r", encoding="utf-8"):
             record = json.loads(line)
             if record["type"] == "hello" and record["protocol"] != 1:
-                sys.exit(f"the stream speaks protocol {record['protocol']}, this program knows protocol 1")
+                sys.exit(f"the stream has protocol version {record['protocol']}, this program supports version 1")
             if record["type"] == "event":
                 print(f"event: {record['message']}", flush=True)
-            # Whatever else comes, now or in later versions of tsgt, is passed over.
+            # Ignore all other types, also those of later versions.
             if record["type"] != "pose":
                 continue
-            # The same pose comes again a few seconds later, smoothed; who needs it now takes it as it is predicted.
+            # Each pose is streamed again a few seconds later, smoothed; this program uses the prediction.
             if record["kind"] == "smoothed":
                 continue
             if not record["valid"]:

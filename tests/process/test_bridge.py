@@ -124,9 +124,9 @@ def test_program_that_ignores_sigterm_is_killed(tmp_path: Path) -> None:
 
     async def use(instrument: BridgeInstrument) -> None:
         await instrument.connect()
-        began = time.monotonic()
+        started_s = time.monotonic()
         await instrument.close()
-        assert time.monotonic() - began < 1.0
+        assert time.monotonic() - started_s < 1.0
 
     with_program(
         "sh",
@@ -189,10 +189,10 @@ def test_endless_output_is_bounded() -> None:
     """A program that prints as fast as it can costs neither memory nor time."""
 
     async def use(instrument: BridgeInstrument) -> None:
-        began = time.monotonic()
+        started_s = time.monotonic()
         with pytest.raises(InstrumentError, match="more than 1000 lines in a second"):
             await instrument.connect()
-        assert time.monotonic() - began < 2.0
+        assert time.monotonic() - started_s < 2.0
 
     with_program("yes", use=use)
     with_program("cat", "/dev/zero", use=use)

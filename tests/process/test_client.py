@@ -100,19 +100,19 @@ def surroundings(folder: Path) -> Iterator[Callable[[str], dict[str, Any]]]:
         env=_environment(),
         text=True,
     ) as process:
-        told, said = process.stdin, process.stdout
-        assert told is not None
+        stdin, said = process.stdin, process.stdout
+        assert stdin is not None
         assert said is not None
 
-        def tell(command: str) -> dict[str, Any]:
-            print(command, file=told, flush=True)
+        def control(command: str) -> dict[str, Any]:
+            print(command, file=stdin, flush=True)
             state = json.loads(said.readline())
             assert isinstance(state, dict)
             return state
 
         try:
             assert said.readline() == "ready\n"
-            yield tell
+            yield control
         finally:
             process.kill()
 
@@ -183,7 +183,7 @@ def test_client_notifies_systemd_and_ends_on_sigterm(folder: Path) -> None:
         mapped = Path(f"/proc/{process.pid}/maps").read_text()
         assert "/scipy/" not in mapped
         assert "/matplotlib/" not in mapped
-        drain(systemd)  # it holds few messages, and who sends one too many is not told
+        drain(systemd)  # it holds few messages, and drops further ones silently
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=1.0) == 0
         while (message := systemd.recv(1000)) != b"STOPPING=1":
@@ -229,16 +229,16 @@ def test_client_recovers_channel_and_instrument(folder: Path) -> None:
 
 def test_cable_that_returns_under_another_name(folder: Path) -> None:
     """The stable name leads to another terminal: measurements come within 3 s."""
-    with surroundings(folder) as tell, client(folder) as (process, _):
+    with surroundings(folder) as control, client(folder) as (process, _):
         systemd_ready(folder)
         wait_for(folder, 5)
         name = str((folder / "instrument.tty").readlink())
-        assert tell("unplug")["tty"] is None
+        assert control("unplug")["tty"] is None
         before = wait_until(folder, instrument=None)
-        back = tell("plug")
+        back = control("plug")
         assert back["tty"] not in (None, name)
         wait_for(folder, before["measurements"] + 20)
-        state = tell("plug")  # it is in already
+        state = control("plug")  # already plugged in
         wait_for(folder, asked(folder)["measurements"] + 2)  # what was under way has come
         assert process.poll() is None
     (path,) = (folder / "journals").iterdir()

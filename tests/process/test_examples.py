@@ -52,4 +52,4 @@ def test_example_stops_at_another_protocol(tmp_path: Path) -> None:
     """It does not interpret another version of the protocol."""
     code, (line,) = followed(tmp_path, [b'{"type":"hello","protocol":2}'])
     assert code == 1
-    assert "speaks protocol 2" in line
+    assert "has protocol version 2" in line

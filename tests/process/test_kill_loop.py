@@ -33,5 +33,5 @@ def test_random_kills_lose_nothing(tmp_path: Path) -> None:
     assert done.returncode == 0
     counts = result["counts"]
     assert counts["kills"] >= 6
-    # Five of each station after the last kill at least.
+    # At least five of each station after the last kill.
     assert counts["measurements recorded"] == counts["measurements journalled"] >= 15

@@ -73,10 +73,10 @@ def test_master_streams_without_radio_and_ends_on_sigterm(
     with connected(config.parent / "poses.sock") as reader, reader.makefile("rb") as lines:
         while json.loads(lines.readline())["type"] != "status":
             pass
-        told = time.monotonic()
+        signalled_s = time.monotonic()
         daemon.send_signal(signal.SIGTERM)
         assert daemon.wait(timeout=10) == 0
-        assert time.monotonic() - told < 1.0
+        assert time.monotonic() - signalled_s < 1.0
     (recording,) = (config.parent / "recordings").iterdir()
     types = [line.type for line in read_lines(recording)]
     assert types[:3] == ["recording", "parameters", "event"]

@@ -65,7 +65,7 @@ def test_kill_tears_one_line_at_most(path: Path) -> None:
         assert kinds.count("recording") == kinds.count("parameters") == session
         assert len(problems) <= 1
     recording = load_recording(path)
-    # Within each session no line is missing: the numbers run on, or begin anew.
+    # Within each session no line is missing: the numbers increase by one, or restart.
     sequences = [one.sequence for one in recording.measurements]
     assert all(b in (a + 1, 0) for a, b in itertools.pairwise(sequences))
     assert sequences.count(0) <= KILLS

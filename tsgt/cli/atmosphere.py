@@ -27,7 +27,7 @@ RESPONSE_TIMEOUT_S = 30.0
 """An instrument that is measuring a target in two faces responds after that."""
 
 NOTICE_AFTER_S = 2.0
-"""From then on a waiting user is told the reason."""
+"""After this time the reason for the wait is printed."""
 
 
 # A negative temperature looks like an option.
@@ -39,7 +39,6 @@ NOTICE_AFTER_S = 2.0
     "socket_path",
     type=path_type,
     default=DEFAULT_CLIENT_SOCKET,
-    show_default=True,
     help="Status socket of the client.",
 )
 @json_option

@@ -42,7 +42,6 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
     "--records",
     type=click.Choice(["poses", "measurements"]),
     default="poses",
-    show_default=True,
     help="Content of a CSV file. TUM contains poses, MCAP poses and prism positions.",
 )
 @click.option(
@@ -60,6 +59,7 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
     "--output",
     type=click.Path(path_type=Path, allow_dash=True),
     default=STDOUT,
+    show_default=False,
     help="File to write: .tum, .csv or .mcap.  [default: stdout, except for MCAP]",
 )
 @keep_going_option

@@ -63,12 +63,9 @@ class _Speed(click.FloatRange):
     "--speed",
     type=_Speed(min=0.001),
     default=1.0,
-    show_default=True,
     help="Factor on the pace of the recording; inf: as fast as the readers receive.",
 )
-@click.option(
-    "--wait/--no-wait", default=True, show_default=True, help="Start when the first reader has connected."
-)
+@click.option("--wait/--no-wait", default=True, help="Start when the first reader has connected.")
 @keep_going_option
 def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep_going: bool) -> None:
     """Stream a recording again.

@@ -35,7 +35,7 @@ def model_option(model: type[BaseModel], field: str, *declarations: str, **setti
     if not declarations:
         declarations = (f"--{field.replace('_', '-')}",)
     default = None if info.is_required() else info.default
-    made: dict[str, Any] = {"help": info.description, "default": default, "show_default": default is not None}
+    made: dict[str, Any] = {"help": info.description, "default": default}
     if info.annotation is bool:
         made["is_flag"] = True
     else:

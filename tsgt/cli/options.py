@@ -107,15 +107,12 @@ socket_option = click.option(
     type=path_type,
     default=DEFAULT_SOCKET,
     envvar="TSGT_SOCKET",
-    show_default=True,
     show_envvar=True,
     help="UNIX socket of the pose stream.",
 )
 
 keep_going_option = click.option(
-    "--keep-going",
-    is_flag=True,
-    help="Report and skip unreadable lines instead of stopping at the first.",
+    "--keep-going", is_flag=True, help="Report and skip unreadable lines instead of stopping at the first."
 )
 
 recording_argument = click.argument("recording", type=path_type)

@@ -39,7 +39,7 @@ def _walk(
         info_name=path.rsplit(" ", 1)[-1],
         terminal_width=100,
         max_content_width=100,
-        help_option_names=HELP_OPTIONS["help_option_names"],
+        **HELP_OPTIONS,
     )
     yield path, context
     if isinstance(command, click.Group):

@@ -79,11 +79,7 @@ def _without_response(
 
 
 def _client_checks(
-    machine: Machine,
-    path: Path,
-    config: ClientConfig,
-    service: Mapping[str, str] | None,
-    daemon: DaemonState,
+    machine: Machine, path: Path, config: ClientConfig, service: Mapping[str, str] | None, daemon: DaemonState
 ) -> Iterator[tuple[str, Check]]:
     user = computer.daemon_user(machine, service) or machine.user
     instrument = config.instrument
@@ -100,11 +96,7 @@ def _client_checks(
 
 
 def _master_checks(
-    machine: Machine,
-    path: Path,
-    config: MasterConfig,
-    service: Mapping[str, str] | None,
-    daemon: DaemonState,
+    machine: Machine, path: Path, config: MasterConfig, service: Mapping[str, str] | None, daemon: DaemonState
 ) -> Iterator[tuple[str, Check]]:
     yield "setup", partial(files.check_setup, machine, config)
     yield from _common_checks(machine, path, config, service, daemon)

@@ -90,10 +90,7 @@ def check_key(machine: Machine, protocol: ProtocolConfig, user: User) -> Finding
     except ConfigError as error:
         return failed("key", str(error))
     if machine.user.uid not in (0, user.uid):
-        return ok(
-            "key",
-            f"{path}: belongs to the user {user.name} only; sudo tsgt doctor checks its content",
-        )
+        return ok("key", f"{path}: belongs to the user {user.name} only; sudo tsgt doctor checks its content")
     try:
         read_key(path, owner=user.uid)
     except ConfigError as error:
@@ -214,8 +211,7 @@ def check_disk(
     if existing == folder and not user.may_use(folder):
         return [
             failed(
-                "disk",
-                f"the user {user.name} may not write to {folder}: sudo chown -R {user.name} {folder}",
+                "disk", f"the user {user.name} may not write to {folder}: sudo chown -R {user.name} {folder}"
             ),
             skipped("disk_write", "the user of the daemon may not write to it"),
         ]
@@ -237,8 +233,7 @@ def _check_space(machine: Machine, folder: Path, existing: Path, kind: str) -> F
         )
     if hours < MIN_HOURS:
         return failed(
-            "disk",
-            f"{folder}: space for {hours:.1f} hours; move old files elsewhere (ls {folder})",
+            "disk", f"{folder}: space for {hours:.1f} hours; move old files elsewhere (ls {folder})"
         )
     return ok("disk", f"{folder}: space for {min(hours, 9999):.0f} hours")
 

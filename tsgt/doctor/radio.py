@@ -109,8 +109,7 @@ def check_limits(config: ClientConfig | MasterConfig, path: Path) -> Finding:
         return note("limits", f"{text}. {'; '.join(found)}. For settings that comply: `{plan}`")
     if config.radio.region is None:
         return note(
-            "limits",
-            f'{text}; no region is configured, so the legal limits are unknown: region = "EU868"',
+            "limits", f'{text}; no region is configured, so the legal limits are unknown: region = "EU868"'
         )
     return ok("limits", f"{text}; within the known limits of {config.radio.region}, with a dipole")
 

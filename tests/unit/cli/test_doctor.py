@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMachine:
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMachine:
     """Return a fake machine without hardware, whose checks need virtual time."""
     made = FakeMachine(tmp_path)
     made.change("client.toml", 'kind = "sx127x"', 'kind = "simulated"\nair_socket = "air"\nname = "one"')
@@ -31,9 +31,9 @@ def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeMachine:
     return made
 
 
-def test_ready_machine_exits_with_0(tsgt: Tsgt, made_up: FakeMachine) -> None:
+def test_ready_machine_exits_with_0(tsgt: Tsgt, fake: FakeMachine) -> None:
     """One line per check, then the sum."""
-    done = tsgt("doctor", made_up.folder / "client.toml")
+    done = tsgt("doctor", fake.folder / "client.toml")
     assert done.code == 0, done.out
     *lines, total = done.out.splitlines()
     assert lines[0].startswith("ok      configuration")
@@ -41,10 +41,10 @@ def test_ready_machine_exits_with_0(tsgt: Tsgt, made_up: FakeMachine) -> None:
     assert total == f"all {sum(not line.startswith('skipped') for line in lines)} checks passed"
 
 
-def test_failed_check_exits_with_3(tsgt: Tsgt, made_up: FakeMachine) -> None:
+def test_failed_check_exits_with_3(tsgt: Tsgt, fake: FakeMachine) -> None:
     """The other checks run as well."""
-    made_up.programs = set()
-    done = tsgt("doctor", made_up.folder / "client.toml")
+    fake.programs = set()
+    done = tsgt("doctor", fake.folder / "client.toml")
     assert done.code == 3
     (line,) = (line for line in done.out.splitlines() if line.startswith("FAILED"))
     assert "instrument" in line
@@ -52,10 +52,10 @@ def test_failed_check_exits_with_3(tsgt: Tsgt, made_up: FakeMachine) -> None:
     assert done.out.splitlines()[-1].startswith("1 of ")
 
 
-def test_json_has_each_check_by_name(tsgt: Tsgt, made_up: FakeMachine) -> None:
+def test_json_has_each_check_by_name(tsgt: Tsgt, fake: FakeMachine) -> None:
     """``ok`` of a skipped check is null."""
-    made_up.programs = set()
-    done = tsgt("doctor", made_up.folder / "client.toml", "--json")
+    fake.programs = set()
+    done = tsgt("doctor", fake.folder / "client.toml", "--json")
     assert done.code == 3
     said = done.json()
     assert said["ok"] is False
@@ -69,10 +69,10 @@ def test_json_has_each_check_by_name(tsgt: Tsgt, made_up: FakeMachine) -> None:
 
 
 def test_default_configuration_is_found(
-    tsgt: Tsgt, made_up: FakeMachine, monkeypatch: pytest.MonkeyPatch
+    tsgt: Tsgt, fake: FakeMachine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If both defaults exist, one has to be given."""
-    there, missing = made_up.folder / "client.toml", made_up.folder / "no.toml"
+    there, missing = fake.folder / "client.toml", fake.folder / "no.toml"
     monkeypatch.setattr(doctor, "DEFAULT_CONFIGS", (there, missing))
     assert tsgt("doctor").code == 0
     monkeypatch.setattr(doctor, "DEFAULT_CONFIGS", (there, there))
@@ -87,7 +87,7 @@ def test_doctor_on_this_machine(tsgt: Tsgt, tmp_path: Path) -> None:
     """Missing hardware is a finding, not an error."""
     FakeMachine(tmp_path)
     done = tsgt("doctor", tmp_path / "client.toml", "--json")
-    assert done.code == 3  # the adapter of a made-up machine is no terminal
+    assert done.code == 3  # the adapter of the fake machine is no terminal
     assert all(check["detail"] for check in done.json()["checks"].values())
     assert "please report" not in done.out
 

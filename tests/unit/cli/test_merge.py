@@ -26,12 +26,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
 def test_merge_reports_each_journal(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:
     """Text and JSON agree, and a second merge adds nothing."""
     path = recording(run, tmp_path / "r.jsonl")
-    told = tsgt("merge", path, *journals(run), "--output", tmp_path / "o.jsonl")
-    assert told.code == 0
+    merged = tsgt("merge", path, *journals(run), "--output", tmp_path / "o.jsonl")
+    assert merged.code == 0
     figures = tsgt("merge", path, *journals(run), "--json").json()
     assert figures["added"] == sum(journal["added"] for journal in figures["journals"]) > 0
     assert figures["journals"][0]["path"] == str(journals(run)[0])
-    first, *_, last = told.out.splitlines()
+    first, *_, last = merged.out.splitlines()
     counts = figures["journals"][0]
     assert first == (
         f"{counts['path']}: {counts['added']} of {counts['measurements']} measurements added, "
@@ -66,12 +66,14 @@ def test_skipped_journal_is_a_warning(tsgt: Tsgt, run: MissionResult, tmp_path: 
     """If no journal is left, it is an error."""
     path, other = recording(run, tmp_path / "r.jsonl"), tmp_path / "station9.jsonl"
     other.write_bytes(journals(run)[0].read_bytes().replace(b'"station":1', b'"station":9'))
-    told = tsgt("merge", path, *journals(run), other)
-    assert told.code == 0
-    assert told.err == f"warning: {other}: skipped: is of station 9, but the recording has only 1, 2, 3\n"
-    told = tsgt("merge", path, other)
-    assert told.code == 1
-    assert told.err.startswith(f"error: {path}: none of the journals can be merged; {other}: is of station 9")
+    merged = tsgt("merge", path, *journals(run), other)
+    assert merged.code == 0
+    assert merged.err == f"warning: {other}: skipped: is of station 9, but the recording has only 1, 2, 3\n"
+    merged = tsgt("merge", path, other)
+    assert merged.code == 1
+    assert merged.err.startswith(
+        f"error: {path}: none of the journals can be merged; {other}: is of station 9"
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b'{"type":"recor', b'{"type":"recording","version":1}\n{"ty'])
@@ -79,9 +81,9 @@ def test_empty_journal_is_skipped(tsgt: Tsgt, run: MissionResult, tmp_path: Path
     """A client killed at its start leaves one; the others are merged."""
     path, begun = recording(run, tmp_path / "r.jsonl"), tmp_path / "station1-begun.jsonl"
     begun.write_bytes(content)
-    told = tsgt("merge", path, *journals(run), begun)
-    assert told.code == 0
-    assert f"{begun}: is empty" in told.err
+    merged = tsgt("merge", path, *journals(run), begun)
+    assert merged.code == 0
+    assert f"{begun}: is empty" in merged.err
     assert "0 measurements added" in tsgt("merge", path, begun).out
 
 
@@ -89,17 +91,17 @@ def test_torn_line_is_removed_with_a_warning(tsgt: Tsgt, run: MissionResult, tmp
     """The recording of a killed master ends with one."""
     path = recording(run, tmp_path / "r.jsonl")
     path.write_bytes(path.read_bytes() + b'{"type":"mea')
-    told = tsgt("merge", path, *journals(run))
-    assert told.err == f"warning: {path}: removed a torn last line of 12 bytes\n"
+    merged = tsgt("merge", path, *journals(run))
+    assert merged.err == f"warning: {path}: removed a torn last line of 12 bytes\n"
 
 
 def test_merge_does_not_replace_an_input(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:
     """Neither the recording nor a journal."""
     path = recording(run, tmp_path / "r.jsonl")
     for input_path in (path, journals(run)[1]):
-        told = tsgt("merge", path, *journals(run), "--output", input_path)
-        assert told.code == 2
-        assert "would replace its own input" in told.err
+        merged = tsgt("merge", path, *journals(run), "--output", input_path)
+        assert merged.code == 2
+        assert "would replace its own input" in merged.err
 
 
 def test_merge_needs_a_journal(tsgt: Tsgt, run: MissionResult, tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_own_file_in_a_sticky_folder_is_accepted(file: Path) -> None:
 def test_file_of_another_user_in_a_sticky_folder_is_rejected(file: Path) -> None:
     """Files of root are accepted."""
     os.chown(file, 12345, -1)
-    check_permissions(file)  # in a folder of the user's it is the user's business whose they are
+    check_permissions(file)  # in a folder of the user any owner is accepted
     file.parent.chmod(0o1777)
     check_permissions(file, user=12345)
     with pytest.raises(ConfigError, match=r"belongs to the user 12345 and lies in .* a folder of your own"):

@@ -20,62 +20,62 @@ TIMEDATECTL = "timedatectl show --property=NTP --property=NTPSynchronized"
 
 async def test_disabled_service_fails(tmp_path: Path) -> None:
     """The finding says what to type."""
-    made_up = FakeMachine(tmp_path)
-    made_up.service = {"LoadState": "loaded", "UnitFileState": "disabled"}
-    found = (await made_up.run_checks())["service"]
+    fake = FakeMachine(tmp_path)
+    fake.service = {"LoadState": "loaded", "UnitFileState": "disabled"}
+    found = (await fake.run_checks())["service"]
     assert found.ok is False
     assert "sudo systemctl enable tsgt-client" in found.detail
 
 
 async def test_restarting_service_fails(tmp_path: Path) -> None:
     """An enabled service may still fail repeatedly."""
-    made_up = FakeMachine(tmp_path)
-    made_up.service = {"LoadState": "loaded", "UnitFileState": "enabled", "SubState": "auto-restart"}
-    found = (await made_up.run_checks("master.toml"))["service"]
+    fake = FakeMachine(tmp_path)
+    fake.service = {"LoadState": "loaded", "UnitFileState": "enabled", "SubState": "auto-restart"}
+    found = (await fake.run_checks("master.toml"))["service"]
     assert found.ok is False
     assert "journalctl -u tsgt-master" in found.detail
 
 
 async def test_missing_service_is_a_note(tmp_path: Path) -> None:
     """The daemon may be started by hand."""
-    made_up = FakeMachine(tmp_path)
-    made_up.service = {"LoadState": "not-found"}
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.service = {"LoadState": "not-found"}
+    findings = await fake.run_checks()
     assert findings["service"].outcome is Outcome.NOTE
     assert "pi, who runs this" in findings["user"].detail
 
 
 async def test_service_is_skipped_without_systemd(tmp_path: Path) -> None:
     """The state is unknown."""
-    made_up = FakeMachine(tmp_path)
-    made_up.service = None
-    assert (await made_up.run_checks())["service"].ok is None
+    fake = FakeMachine(tmp_path)
+    fake.service = None
+    assert (await fake.run_checks())["service"].ok is None
 
 
 async def test_service_with_another_configuration_is_a_note(tmp_path: Path) -> None:
     """The service reads another file than the checked one."""
-    made_up = FakeMachine(tmp_path)
-    assert made_up.service is not None
-    made_up.service["ExecStart"] = (
+    fake = FakeMachine(tmp_path)
+    assert fake.service is not None
+    fake.service["ExecStart"] = (
         "{ path=/opt/tsgt/bin/tsgt-client ; argv[]=/opt/tsgt/bin/tsgt-client --config /etc/tsgt/client.toml ; "
         "ignore_errors=no }"
     )
-    found = (await made_up.run_checks())["service"]
+    found = (await fake.run_checks())["service"]
     assert found.outcome is Outcome.NOTE
     assert "tsgt doctor /etc/tsgt/client.toml" in found.detail
 
 
 async def test_missing_service_user_fails(tmp_path: Path) -> None:
     """A unit with a missing user or group never starts."""
-    made_up = FakeMachine(tmp_path)
-    made_up.daemon = None
-    found = (await made_up.run_checks())["user"]
+    fake = FakeMachine(tmp_path)
+    fake.daemon = None
+    found = (await fake.run_checks())["user"]
     assert found.ok is False
     assert "spi gpio dialout" in found.detail
 
 
 @pytest.mark.parametrize(
-    ("name", "says", "outcome", "tells"),
+    ("name", "says", "outcome", "expected"),
     [
         ("client.toml", "NTP=yes\nNTPSynchronized=no\n", Outcome.NOTE, "sudo timedatectl set-ntp false"),
         ("client.toml", "NTP=no\nNTPSynchronized=no\n", Outcome.OK, "2026-11-21"),
@@ -86,37 +86,37 @@ async def test_missing_service_user_fails(tmp_path: Path) -> None:
     ],
 )
 async def test_ntp_outcome_by_daemon_and_state(
-    tmp_path: Path, name: str, says: str | None, outcome: Outcome, tells: str
+    tmp_path: Path, name: str, says: str | None, outcome: Outcome, expected: str
 ) -> None:
     """A client's clock must not be steered; a master's may be, before the daemon starts."""
-    made_up = FakeMachine(tmp_path)
-    made_up.commands = {} if says is None else {TIMEDATECTL: says}
-    found = (await made_up.run_checks(name))["ntp"]
+    fake = FakeMachine(tmp_path)
+    fake.commands = {} if says is None else {TIMEDATECTL: says}
+    found = (await fake.run_checks(name))["ntp"]
     assert found.outcome is outcome
-    assert tells in found.detail
+    assert expected in found.detail
 
 
 async def test_master_with_unset_clock_fails(tmp_path: Path) -> None:
     """Poses use the master's time; a client's time does not matter."""
-    made_up = FakeMachine(tmp_path)
-    made_up.now_ns = 1_000_000_000
-    assert (await made_up.run_checks("master.toml"))["ntp"].ok is False
-    assert (await made_up.run_checks("client.toml"))["ntp"].ok is True
+    fake = FakeMachine(tmp_path)
+    fake.now_ns = 1_000_000_000
+    assert (await fake.run_checks("master.toml"))["ntp"].ok is False
+    assert (await fake.run_checks("client.toml"))["ntp"].ok is True
 
 
 async def test_slow_clock_source_is_a_note(tmp_path: Path) -> None:
     """A PC without tsc still works."""
-    made_up = FakeMachine(tmp_path)
-    made_up.write(CLOCK_SOURCE, "hpet\n")
-    assert (await made_up.run_checks())["clock_source"].outcome is Outcome.NOTE
+    fake = FakeMachine(tmp_path)
+    fake.write(CLOCK_SOURCE, "hpet\n")
+    assert (await fake.run_checks())["clock_source"].outcome is Outcome.NOTE
 
 
 async def test_missing_proc_and_sys_is_no_failure(tmp_path: Path) -> None:
     """The checks are notes or skipped."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     (tmp_path / CLOCK_SOURCE).unlink()
     (tmp_path / "proc/sys/kernel/random/boot_id").unlink()
-    findings = await made_up.run_checks()
+    findings = await fake.run_checks()
     assert findings["clock_source"].outcome is Outcome.SKIPPED
     assert findings["boot_id"].outcome is Outcome.NOTE
 
@@ -128,16 +128,16 @@ def test_permissions_follow_the_mode(tmp_path: Path) -> None:
     found = device.stat()
     owner = User(name="owner", uid=found.st_uid or 1, groups=frozenset())
     member = User(name="member", uid=4711, groups=frozenset({found.st_gid}))
-    stranger = User(name="stranger", uid=4712, groups=frozenset())
+    other = User(name="other", uid=4712, groups=frozenset())
     for mode, users in (
         (0o060, {"member"}),
-        (0o006, {"stranger"}),
+        (0o006, {"other"}),
         (0o040, set()),
-        (0o666, {"member", "stranger"}),
+        (0o666, {"member", "other"}),
     ):
         device.chmod(mode)
-        assert {user.name for user in (member, stranger) if user.may_use(device)} == users
-    if found.st_uid:  # else who runs the test is root, who may do everything
+        assert {user.name for user in (member, other) if user.may_use(device)} == users
+    if found.st_uid:  # unless the test runs as root
         device.chmod(0o600)
         assert owner.may_use(device)
     folder = tmp_path / "folder"

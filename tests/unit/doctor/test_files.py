@@ -25,29 +25,29 @@ async def test_ready_machine_has_no_failure(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "tells"),
+    ("old", "new", "expected"),
     [
         ("station = 1", "stationn = 1", "did you mean station?"),
         ("frequency_mhz = 869.525", "frequency_mhz = 905.0", "not within a band of EU868"),
     ],
 )
 async def test_invalid_configuration_fails_and_other_checks_run(
-    tmp_path: Path, old: str, new: str, tells: str
+    tmp_path: Path, old: str, new: str, expected: str
 ) -> None:
     """It is the first finding; checks without configuration follow."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", old, new)
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", old, new)
+    findings = await fake.run_checks()
     assert findings["configuration"].ok is False
-    assert tells in findings["configuration"].detail
+    assert expected in findings["configuration"].detail
     assert set(findings) == {"configuration", "clock_source", "ntp", "boot_id"}
 
 
 async def test_file_of_another_kind_fails(tmp_path: Path) -> None:
     """A set-up file or a missing file is no configuration."""
-    made_up = FakeMachine(tmp_path)
-    assert "client or a master" in (await made_up.run_checks("frames.toml"))["configuration"].detail
-    assert "no such file" in (await made_up.run_checks("nothing.toml"))["configuration"].detail
+    fake = FakeMachine(tmp_path)
+    assert "client or a master" in (await fake.run_checks("frames.toml"))["configuration"].detail
+    assert "no such file" in (await fake.run_checks("nothing.toml"))["configuration"].detail
 
 
 @pytest.mark.parametrize(
@@ -56,50 +56,50 @@ async def test_file_of_another_kind_fails(tmp_path: Path) -> None:
 )
 async def test_world_writable_file_fails(tmp_path: Path, file: str, finding: str) -> None:
     """The finding has the command that fixes it."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     (tmp_path / file).chmod(0o666)
-    found = (await made_up.run_checks("master.toml"))[finding]
+    found = (await fake.run_checks("master.toml"))[finding]
     assert found.ok is False
     assert f"chmod o-w {tmp_path / file}" in found.detail
 
 
 async def test_missing_key_file_fails(tmp_path: Path) -> None:
     """The daemon would not start."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     (tmp_path / "radio.key").unlink()
-    found = (await made_up.run_checks())["key"]
+    found = (await fake.run_checks())["key"]
     assert found.ok is False
     assert "tsgt radio key" in found.detail
 
 
 async def test_key_readable_by_others_fails(tmp_path: Path) -> None:
     """The finding has the command that fixes it."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     (tmp_path / "radio.key").chmod(0o644)
-    assert "chmod 600" in (await made_up.run_checks())["key"].detail
+    assert "chmod 600" in (await fake.run_checks())["key"].detail
 
 
 async def test_invalid_key_fails(tmp_path: Path) -> None:
     """Owner and mode are right, the content is not."""
-    made_up = FakeMachine(tmp_path)
-    made_up.write("radio.key", "secret")
-    assert "not a key" in (await made_up.run_checks())["key"].detail
+    fake = FakeMachine(tmp_path)
+    fake.write("radio.key", "secret")
+    assert "not a key" in (await fake.run_checks())["key"].detail
 
 
 async def test_key_must_belong_to_the_daemon_user(tmp_path: Path) -> None:
     """A key of the user who runs the checks does not help the service."""
-    made_up = FakeMachine(tmp_path)
-    made_up.daemon = User(name="tsgt", uid=os.geteuid() + 1, groups=frozenset({os.getegid()}))
-    found = (await made_up.run_checks())["key"]
+    fake = FakeMachine(tmp_path)
+    fake.daemon = User(name="tsgt", uid=os.geteuid() + 1, groups=frozenset({os.getegid()}))
+    found = (await fake.run_checks())["key"]
     assert found.ok is False
     assert "chown" in found.detail
 
 
 async def test_no_key_is_a_note(tmp_path: Path) -> None:
     """Anybody can take part."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", 'key_file = "radio.key"', "")
-    assert (await made_up.run_checks())["key"].outcome is Outcome.NOTE
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", 'key_file = "radio.key"', "")
+    assert (await fake.run_checks())["key"].outcome is Outcome.NOTE
 
 
 async def test_protocol_without_a_key_is_skipped(tmp_path: Path) -> None:
@@ -119,10 +119,10 @@ async def test_recent_set_up_passes(tmp_path: Path) -> None:
 
 async def test_old_frames_are_a_note(tmp_path: Path) -> None:
     """Moved tripods need new frames; the prism layout stays."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     for name in ("frames.toml", "layout.toml"):
         os.utime(tmp_path / name, ns=(NOW_NS, NOW_NS - 72 * HOUR_NS))
-    findings = await made_up.run_checks("master.toml")
+    findings = await fake.run_checks("master.toml")
     assert findings["station_frames"].outcome is Outcome.NOTE
     assert "3 days ago" in findings["station_frames"].detail
     assert "tsgt calibrate check" in findings["station_frames"].detail
@@ -131,19 +131,19 @@ async def test_old_frames_are_a_note(tmp_path: Path) -> None:
 
 async def test_age_is_unknown_with_a_wrong_clock(tmp_path: Path) -> None:
     """A file from the future shows that the clock is behind."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     os.utime(tmp_path / "frames.toml", ns=(NOW_NS, NOW_NS + HOUR_NS))
-    found = (await made_up.run_checks("master.toml"))["station_frames"]
+    found = (await fake.run_checks("master.toml"))["station_frames"]
     assert found.outcome is Outcome.NOTE
     assert "unknown" in found.detail
 
 
 async def test_example_set_up_is_a_note(tmp_path: Path) -> None:
     """Nobody has calibrated with the example files."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("frames.toml", "# written by", "# not written by anybody, as by")
-    made_up.change("layout.toml", "# written by tsgt calibrate", "#")
-    findings = await made_up.run_checks("master.toml")
+    fake = FakeMachine(tmp_path)
+    fake.change("frames.toml", "# written by", "# not written by anybody, as by")
+    fake.change("layout.toml", "# written by tsgt calibrate", "#")
+    findings = await fake.run_checks("master.toml")
     assert "is it the example?" in findings["prism_layout"].detail
 
 
@@ -158,17 +158,17 @@ async def test_example_set_up_is_a_note(tmp_path: Path) -> None:
 )
 async def test_inconsistent_set_up_fails(tmp_path: Path, file: str, old: str, new: str, name: str) -> None:
     """A missing frame, prism or file, and coincident prisms are each reported for their file."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change(file, old, new)
-    findings = await made_up.run_checks("master.toml")
+    fake = FakeMachine(tmp_path)
+    fake.change(file, old, new)
+    findings = await fake.run_checks("master.toml")
     assert [each.name for each in findings.values() if each.ok is False] == [name]
 
 
 async def test_disk_with_little_space_fails(tmp_path: Path) -> None:
     """The finding states the hours."""
-    made_up = FakeMachine(tmp_path)
-    made_up.free_bytes = 44_000_000
-    found = (await made_up.run_checks())["disk"]
+    fake = FakeMachine(tmp_path)
+    fake.free_bytes = 44_000_000
+    found = (await fake.run_checks())["disk"]
     assert found.ok is False
     assert "2.0 hours" in found.detail
 
@@ -176,41 +176,41 @@ async def test_disk_with_little_space_fails(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["tmpfs", "overlay"])
 async def test_disk_in_memory_fails(tmp_path: Path, kind: str) -> None:
     """It loses everything at a power cut."""
-    made_up = FakeMachine(tmp_path)
-    made_up.write("proc/mounts", f"/dev/root / ext4 rw 0 0\nnone {tmp_path} {kind} rw 0 0\n")
-    found = (await made_up.run_checks())["disk"]
+    fake = FakeMachine(tmp_path)
+    fake.write("proc/mounts", f"/dev/root / ext4 rw 0 0\nnone {tmp_path} {kind} rw 0 0\n")
+    found = (await fake.run_checks())["disk"]
     assert found.ok is False
     assert kind in found.detail
 
 
 async def test_missing_folder_is_created_by_the_service(tmp_path: Path) -> None:
     """Without a unit the user must be able to create it."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", 'directory = "journals"', 'directory = "new/journals"')
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", 'directory = "journals"', 'directory = "new/journals"')
+    findings = await fake.run_checks()
     assert (findings["disk"].ok, findings["disk_write"].ok) == (True, None)
-    made_up.service = None
-    made_up.here = User(name="pi", uid=4711, groups=frozenset())
-    found = (await made_up.run_checks())["disk"]
+    fake.service = None
+    fake.here = User(name="pi", uid=4711, groups=frozenset())
+    found = (await fake.run_checks())["disk"]
     assert found.ok is False
     assert "sudo install -d -o pi" in found.detail
 
 
 async def test_folder_of_another_user_fails(tmp_path: Path) -> None:
     """The daemon could not write."""
-    made_up = FakeMachine(tmp_path)
-    made_up.daemon = User(name="tsgt", uid=4711, groups=frozenset())
-    found = (await made_up.run_checks())["disk"]
+    fake = FakeMachine(tmp_path)
+    fake.daemon = User(name="tsgt", uid=4711, groups=frozenset())
+    found = (await fake.run_checks())["disk"]
     assert found.ok is False
     assert "sudo chown -R tsgt" in found.detail
 
 
 async def test_folder_outside_the_sandbox_fails(tmp_path: Path) -> None:
     """Permissions do not help a sandboxed service."""
-    made_up = FakeMachine(tmp_path)
-    assert made_up.service is not None
-    made_up.service["ReadWritePaths"] = "-/media/disk"
-    found = (await made_up.run_checks())["disk"]
+    fake = FakeMachine(tmp_path)
+    assert fake.service is not None
+    fake.service["ReadWritePaths"] = "-/media/disk"
+    found = (await fake.run_checks())["disk"]
     assert found.ok is False
     assert f"ReadWritePaths={tmp_path}/journals" in found.detail
 
@@ -223,10 +223,10 @@ async def test_write_test_leaves_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "tells"), [(30, "remount,rw"), (28, "No space left"), (13, "sudo tsgt doctor")]
+    ("number", "expected"), [(30, "remount,rw"), (28, "No space left"), (13, "sudo tsgt doctor")]
 )
 async def test_unwritable_disk_reports_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, tells: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, expected: str
 ) -> None:
     """Read-only, full, or no permission for the user of the checks, which is no failure."""
 
@@ -236,4 +236,4 @@ async def test_unwritable_disk_reports_the_reason(
     monkeypatch.setattr(os, "fsync", refuse)
     found = (await FakeMachine(tmp_path).run_checks())["disk_write"]
     assert found.ok is (None if number == 13 else False)
-    assert tells in found.detail
+    assert expected in found.detail

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 NAMES = ("instrument", "licence", "battery", "level")
 
 
-def connected(made_up: FakeMachine) -> tuple[SimulatedTotalStation, SimulatedLine]:
+def connected(fake: FakeMachine) -> tuple[SimulatedTotalStation, SimulatedLine]:
     """Connect a simulated total station to a machine's line."""
     scenario = ScenarioConfig()
     timeline = running_timeline()
@@ -36,7 +36,7 @@ def connected(made_up: FakeMachine) -> tuple[SimulatedTotalStation, SimulatedLin
         scenario.stations[0], scenario, scenario_world(scenario, 60.0, rng), timeline, rng
     )
     line = SimulatedLine(instrument, timeline, VirtualClock(NOW_NS), name="ttyUSB0")
-    made_up.port = line.open
+    fake.port = line.open
     return instrument, line
 
 
@@ -80,21 +80,21 @@ def client_status(
 
 async def test_ready_instrument_passes(tmp_path: Path) -> None:
     """It is identified, licensed, charged and level, and the line is closed again."""
-    made_up = FakeMachine(tmp_path)
-    _, line = connected(made_up)
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    _, line = connected(fake)
+    findings = await fake.run_checks()
     assert {name: findings[name].outcome for name in NAMES} == dict.fromkeys(NAMES, Outcome.OK)
     assert "85 %" in findings["battery"].detail
-    port = await line.open(115_200)  # raises while somebody has it
+    port = await line.open(115_200)  # raises while the port is open elsewhere
     await port.close()
 
 
 async def test_missing_licence_fails(tmp_path: Path) -> None:
     """Without the licence it does not search or lock."""
-    made_up = FakeMachine(tmp_path)
-    instrument, _ = connected(made_up)
+    fake = FakeMachine(tmp_path)
+    instrument, _ = connected(fake)
     instrument.robotic_licence = False
-    found = (await made_up.run_checks())["licence"]
+    found = (await fake.run_checks())["licence"]
     assert found.ok is False
     assert "GeoCOM Robotic" in found.detail
 
@@ -110,39 +110,39 @@ async def test_low_battery_is_reported(
     outcome: Outcome,
 ) -> None:
     """Half is a note, a fifth is a failure, external power passes."""
-    made_up = FakeMachine(tmp_path)
-    instrument, _ = connected(made_up)
+    fake = FakeMachine(tmp_path)
+    instrument, _ = connected(fake)
     instrument.battery_percent, instrument.external_power = percent, external
-    assert (await made_up.run_checks())["battery"].outcome is outcome
+    assert (await fake.run_checks())["battery"].outcome is outcome
 
 
-@pytest.mark.parametrize(("tilt_rad", "tells"), [(0.0009, "3.1'"), (0.01, "not level")])
-async def test_instrument_that_is_not_level_is_a_note(tmp_path: Path, tilt_rad: float, tells: str) -> None:
+@pytest.mark.parametrize(("tilt_rad", "expected"), [(0.0009, "3.1'"), (0.01, "not level")])
+async def test_instrument_that_is_not_level_is_a_note(tmp_path: Path, tilt_rad: float, expected: str) -> None:
     """On a desk no instrument is level."""
-    made_up = FakeMachine(tmp_path)
-    instrument, _ = connected(made_up)
+    fake = FakeMachine(tmp_path)
+    instrument, _ = connected(fake)
     instrument.tilt_rad = (tilt_rad, 0.0)
-    found = (await made_up.run_checks())["level"]
+    found = (await fake.run_checks())["level"]
     assert found.outcome is Outcome.NOTE
-    assert tells in found.detail
+    assert expected in found.detail
 
 
 async def test_other_baud_rate_is_a_note(tmp_path: Path) -> None:
     """The finding says what to set."""
-    made_up = FakeMachine(tmp_path)
-    connected(made_up)
-    made_up.change("client.toml", 'kind = "leica"', 'kind = "leica"\nbaud = 19_200')
-    found = (await made_up.run_checks())["instrument"]
+    fake = FakeMachine(tmp_path)
+    connected(fake)
+    fake.change("client.toml", 'kind = "leica"', 'kind = "leica"\nbaud = 19_200')
+    found = (await fake.run_checks())["instrument"]
     assert found.outcome is Outcome.NOTE
     assert "baud = 115200" in found.detail
 
 
 async def test_instrument_that_is_off_fails(tmp_path: Path) -> None:
     """One failure; dependent checks are skipped."""
-    made_up = FakeMachine(tmp_path)
-    _, line = connected(made_up)
-    line.faults.drop_requests = True  # nothing wakes it: its battery is out
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    _, line = connected(fake)
+    line.faults.drop_requests = True  # its battery is removed
+    findings = await fake.run_checks()
     assert findings["instrument"].ok is False
     assert "check that it is on" in findings["instrument"].detail
     assert {findings[name].ok for name in NAMES[1:]} == {None}
@@ -158,22 +158,22 @@ def test_instrument_without_target_recognition_fails(tmp_path: Path) -> None:
 
 async def test_line_that_cannot_be_opened_fails(tmp_path: Path) -> None:
     """The finding has the error of the port."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
 
     async def refuse(_baud: int) -> Port:
         raise InstrumentError("ttyUSB0: is locked by somebody")
 
-    made_up.port = refuse
-    assert "locked by somebody" in (await made_up.run_checks())["instrument"].detail
+    fake.port = refuse
+    assert "locked by somebody" in (await fake.run_checks())["instrument"].detail
 
 
 async def test_running_client_reports_the_instrument(tmp_path: Path) -> None:
     """Instrument and radio stay open in the client."""
-    made_up = FakeMachine(tmp_path)
-    made_up.status = client_status()
-    made_up.holders = {"ttyUSB0": "tsgt-client (process 71)", "spidev0.0": "tsgt-client (process 71)"}
-    made_up.hal_error = AssertionError("must not be opened")
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.status = client_status()
+    fake.holders = {"ttyUSB0": "tsgt-client (process 71)", "spidev0.0": "tsgt-client (process 71)"}
+    fake.hal_error = AssertionError("must not be opened")
+    findings = await fake.run_checks()
     assert [each for each in findings.values() if each.ok is False] == []
     assert "1234 measured" in findings["daemon"].detail
     assert "Leica TS16 1234567" in findings["instrument"].detail
@@ -185,9 +185,9 @@ async def test_running_client_reports_the_instrument(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["Leica TS16 1234567", None])
 async def test_problem_of_the_client_fails(tmp_path: Path, name: str | None) -> None:
     """The problem is in the finding."""
-    made_up = FakeMachine(tmp_path)
-    made_up.status = client_status(name, problem="the licence GeoCOM Robotic is missing", battery=None)
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.status = client_status(name, problem="the licence GeoCOM Robotic is missing", battery=None)
+    findings = await fake.run_checks()
     assert findings["instrument"].ok is False
     assert "GeoCOM Robotic is missing" in findings["instrument"].detail
     assert findings["battery"].ok is None
@@ -196,11 +196,11 @@ async def test_problem_of_the_client_fails(tmp_path: Path, name: str | None) -> 
 @pytest.mark.parametrize("name", ["client.toml", "master.toml"])
 async def test_daemon_without_access_is_left_alone(tmp_path: Path, name: str) -> None:
     """Systemd reports that it is running."""
-    made_up = FakeMachine(tmp_path)
-    assert made_up.service is not None
-    made_up.service |= {"ActiveState": "active", "SubState": "running"}
-    made_up.hal_error = AssertionError("must not be opened")
-    findings = await made_up.run_checks(name)
+    fake = FakeMachine(tmp_path)
+    assert fake.service is not None
+    fake.service |= {"ActiveState": "active", "SubState": "running"}
+    fake.hal_error = AssertionError("must not be opened")
+    findings = await fake.run_checks(name)
     assert findings["daemon"].outcome is Outcome.NOTE
     assert "sudo tsgt doctor" in findings["daemon"].detail
     assert findings["radio"].ok is None
@@ -213,20 +213,20 @@ async def test_stuck_client_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     def stuck(_path: Path) -> ClientStatus | None:
         raise StreamError("client.sock: no status within 5 s; the daemon is stuck, see its log")
 
-    made_up = FakeMachine(tmp_path)
-    monkeypatch.setattr(made_up, "ask_client", stuck)
-    found = (await made_up.run_checks())["daemon"]
+    fake = FakeMachine(tmp_path)
+    monkeypatch.setattr(fake, "ask_client", stuck)
+    found = (await fake.run_checks())["daemon"]
     assert found.ok is False
     assert "sudo systemctl restart tsgt-client" in found.detail
 
 
 async def test_bridge_needs_its_program(tmp_path: Path) -> None:
     """A missing or non-executable program fails."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", 'kind = "leica"', 'kind = "bridge"\ncommand = ["my-program"]')
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", 'kind = "leica"', 'kind = "bridge"\ncommand = ["my-program"]')
     text = (tmp_path / "client.toml").read_text()
     lines = [line for line in text.splitlines() if not line.startswith(("port =", "prism_type"))]
-    made_up.write("client.toml", "\n".join(lines))
-    assert (await made_up.run_checks())["instrument"].ok is False
-    made_up.programs = {"my-program"}
-    assert (await made_up.run_checks())["instrument"].ok is True
+    fake.write("client.toml", "\n".join(lines))
+    assert (await fake.run_checks())["instrument"].ok is False
+    fake.programs = {"my-program"}
+    assert (await fake.run_checks())["instrument"].ok is True

@@ -24,9 +24,9 @@ async def test_responding_radio_passes(tmp_path: Path) -> None:
 
 async def test_disabled_bus_fails(tmp_path: Path) -> None:
     """Without SPI there is no radio."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     (tmp_path / "dev/spidev0.0").unlink()
-    findings = await made_up.run_checks()
+    findings = await fake.run_checks()
     assert findings["radio_devices"].ok is False
     assert "raspi-config nonint do_spi 0" in findings["radio_devices"].detail
     assert findings["radio"].ok is None
@@ -34,16 +34,16 @@ async def test_disabled_bus_fails(tmp_path: Path) -> None:
 
 async def test_missing_pins_fail(tmp_path: Path) -> None:
     """A kernel without a driver for the pins has no GPIO chip."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     (tmp_path / "dev/gpiochip0").unlink()
-    assert (await made_up.run_checks())["radio_devices"].ok is False
+    assert (await fake.run_checks())["radio_devices"].ok is False
 
 
 async def test_missing_permissions_fail(tmp_path: Path) -> None:
     """The finding names both devices."""
-    made_up = FakeMachine(tmp_path)
-    made_up.daemon = User(name="tsgt", uid=4711, groups=frozenset())
-    found = (await made_up.run_checks())["radio_devices"]
+    fake = FakeMachine(tmp_path)
+    fake.daemon = User(name="tsgt", uid=4711, groups=frozenset())
+    found = (await fake.run_checks())["radio_devices"]
     assert found.ok is False
     assert "spidev0.0" in found.detail
     assert "gpiochip0" in found.detail
@@ -51,18 +51,18 @@ async def test_missing_permissions_fail(tmp_path: Path) -> None:
 
 async def test_missing_package_is_a_finding(tmp_path: Path) -> None:
     """The finding has the error of the bus."""
-    made_up = FakeMachine(tmp_path)
-    made_up.hal_error = RadioError("the Python package spidev is missing: pip install 'tsgt[pi]'")
-    found = (await made_up.run_checks())["radio"]
+    fake = FakeMachine(tmp_path)
+    fake.hal_error = RadioError("the Python package spidev is missing: pip install 'tsgt[pi]'")
+    found = (await fake.run_checks())["radio"]
     assert found.ok is False
     assert "pip install 'tsgt[pi]'" in found.detail
 
 
 async def test_unexpected_error_is_a_finding(tmp_path: Path) -> None:
     """The other checks run nevertheless."""
-    made_up = FakeMachine(tmp_path)
-    made_up.hal_error = ZeroDivisionError("what?")
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.hal_error = ZeroDivisionError("what?")
+    findings = await fake.run_checks()
     assert findings["radio"].ok is False
     assert "ZeroDivisionError" in findings["radio"].detail
     assert "boot_id" in findings
@@ -70,43 +70,43 @@ async def test_unexpected_error_is_a_finding(tmp_path: Path) -> None:
 
 async def test_radio_of_a_running_daemon_is_left_alone(tmp_path: Path) -> None:
     """Two programs would disturb each other."""
-    made_up = FakeMachine(tmp_path)
-    made_up.served = {tmp_path / "poses.sock"}
-    made_up.hal_error = AssertionError("must not be opened")
-    findings = await made_up.run_checks("master.toml")
+    fake = FakeMachine(tmp_path)
+    fake.served = {tmp_path / "poses.sock"}
+    fake.hal_error = AssertionError("must not be opened")
+    findings = await fake.run_checks("master.toml")
     assert findings["radio"].outcome is Outcome.SKIPPED
     assert "is running" in findings["daemon"].detail
 
 
 async def test_busy_radio_is_not_opened(tmp_path: Path) -> None:
     """The finding names the other process."""
-    made_up = FakeMachine(tmp_path)
-    made_up.holders["spidev0.0"] = "tsgt-master (process 77)"
-    made_up.hal_error = AssertionError("must not be opened")
-    found = (await made_up.run_checks())["radio"]
+    fake = FakeMachine(tmp_path)
+    fake.holders["spidev0.0"] = "tsgt-master (process 77)"
+    fake.hal_error = AssertionError("must not be opened")
+    found = (await fake.run_checks())["radio"]
     assert found.ok is False
     assert "tsgt-master (process 77)" in found.detail
 
 
 async def test_simulated_radio_is_skipped(tmp_path: Path) -> None:
     """A demo has no hardware."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", 'kind = "sx127x"', 'kind = "simulated"\nair_socket = "air"\nname = "one"')
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", 'kind = "sx127x"', 'kind = "simulated"\nair_socket = "air"\nname = "one"')
+    findings = await fake.run_checks()
     assert (findings["radio"].ok, findings["radio_devices"].ok) == (None, None)
 
 
 async def test_settings_within_limits_pass(tmp_path: Path) -> None:
     """500 kHz in Canada, and 7 dBm with a duty cycle of 10 % in Europe."""
-    made_up = FakeMachine(tmp_path)
-    assert (await made_up.run_checks("master.toml"))["limits"].outcome is Outcome.OK
+    fake = FakeMachine(tmp_path)
+    assert (await fake.run_checks("master.toml"))["limits"].outcome is Outcome.OK
 
 
 async def test_exceeded_limits_are_a_note_with_the_plan_command(tmp_path: Path) -> None:
     """The law of the country decides."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("master.toml", "bandwidth_khz = 500.0", "bandwidth_khz = 250.0")
-    found = (await made_up.run_checks("master.toml"))["limits"]
+    fake = FakeMachine(tmp_path)
+    fake.change("master.toml", "bandwidth_khz = 500.0", "bandwidth_khz = 250.0")
+    found = (await fake.run_checks("master.toml"))["limits"]
     assert found.outcome is Outcome.NOTE
     assert "tsgt radio plan --protocol classic --stations 3 --sf 9 --bandwidth-khz 250" in found.detail
     assert "--region CA915" in found.detail
@@ -114,6 +114,6 @@ async def test_exceeded_limits_are_a_note_with_the_plan_command(tmp_path: Path) 
 
 async def test_missing_region_is_a_note(tmp_path: Path) -> None:
     """The legal limits are unknown."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", 'region = "EU868"', "")
-    assert (await made_up.run_checks())["limits"].outcome is Outcome.NOTE
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", 'region = "EU868"', "")
+    assert (await fake.run_checks())["limits"].outcome is Outcome.NOTE

@@ -13,7 +13,7 @@ from tsgt.doctor.machine import User
 if TYPE_CHECKING:
     from pathlib import Path
 
-STRANGER = User(name="tsgt", uid=4711, groups=frozenset())
+SERVICE_USER = User(name="tsgt", uid=4711, groups=frozenset())
 
 
 async def test_ready_line_passes(tmp_path: Path) -> None:
@@ -25,9 +25,9 @@ async def test_ready_line_passes(tmp_path: Path) -> None:
 
 async def test_missing_line_names_existing_adapters(tmp_path: Path) -> None:
     """The finding names another adapter that is plugged in."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", ADAPTER, "usb-another-one")
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", ADAPTER, "usb-another-one")
+    findings = await fake.run_checks()
     assert findings["serial_port"].ok is False
     assert ADAPTER in findings["serial_port"].detail
     for name in ("serial_port_free", "latency_timer", "instrument", "licence", "battery", "level"):
@@ -36,55 +36,55 @@ async def test_missing_line_names_existing_adapters(tmp_path: Path) -> None:
 
 async def test_missing_adapter_is_reported(tmp_path: Path) -> None:
     """Nothing under by-id: the cable is unplugged."""
-    made_up = FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
     (tmp_path / "dev/serial/by-id" / ADAPTER).unlink()
-    assert "no adapter" in (await made_up.run_checks())["serial_port"].detail
+    assert "no adapter" in (await fake.run_checks())["serial_port"].detail
 
 
 async def test_dangling_link_fails(tmp_path: Path) -> None:
     """The device of the link is gone."""
-    made_up = FakeMachine(tmp_path)
-    made_up.tty.unlink()
-    found = (await made_up.run_checks())["serial_port"]
+    fake = FakeMachine(tmp_path)
+    fake.tty.unlink()
+    found = (await fake.run_checks())["serial_port"]
     assert found.ok is False
     assert "is a dangling link" in found.detail
 
 
 async def test_unstable_name_is_a_note_with_the_stable_one(tmp_path: Path) -> None:
     """ttyUSB0 may be ttyUSB1 after the cable was unplugged."""
-    made_up = FakeMachine(tmp_path)
-    made_up.change("client.toml", f"dev/serial/by-id/{ADAPTER}", "dev/ttyUSB0")
-    found = (await made_up.run_checks())["serial_port"]
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", f"dev/serial/by-id/{ADAPTER}", "dev/ttyUSB0")
+    found = (await fake.run_checks())["serial_port"]
     assert found.outcome is Outcome.NOTE
     assert f'port = "{tmp_path}/dev/serial/by-id/{ADAPTER}"' in found.detail
 
 
 async def test_user_without_permission_is_told_the_group(tmp_path: Path) -> None:
     """The user of the service counts, not the user of the checks."""
-    made_up = FakeMachine(tmp_path)
-    made_up.daemon = STRANGER
-    found = (await made_up.run_checks())["serial_port"]
+    fake = FakeMachine(tmp_path)
+    fake.daemon = SERVICE_USER
+    found = (await fake.run_checks())["serial_port"]
     assert found.ok is False
-    group = "dialout" if made_up.tty.stat().st_gid else "rule"
+    group = "dialout" if fake.tty.stat().st_gid else "rule"
     assert group in found.detail
     assert "tsgt" in found.detail
 
 
 async def test_device_of_root_needs_a_rule(tmp_path: Path) -> None:
     """Joining a group does not help if the group has no permission."""
-    made_up = FakeMachine(tmp_path)
-    made_up.daemon = STRANGER
-    made_up.tty.chmod(0o600)
-    found = (await made_up.run_checks())["serial_port"]
+    fake = FakeMachine(tmp_path)
+    fake.daemon = SERVICE_USER
+    fake.tty.chmod(0o600)
+    found = (await fake.run_checks())["serial_port"]
     assert found.ok is False
     assert "udev" in found.detail
 
 
 async def test_busy_line_is_not_opened(tmp_path: Path) -> None:
     """Two programs corrupt each other's data."""
-    made_up = FakeMachine(tmp_path)
-    made_up.holders["ttyUSB0"] = "minicom (process 99)"
-    findings = await made_up.run_checks()
+    fake = FakeMachine(tmp_path)
+    fake.holders["ttyUSB0"] = "minicom (process 99)"
+    findings = await fake.run_checks()
     assert findings["serial_port_free"].ok is False
     assert "minicom (process 99)" in findings["serial_port_free"].detail
     assert findings["instrument"].ok is None
@@ -92,11 +92,11 @@ async def test_busy_line_is_not_opened(tmp_path: Path) -> None:
 
 async def test_modem_manager_is_a_note_without_udev_rules(tmp_path: Path) -> None:
     """It opens every line that is plugged in."""
-    made_up = FakeMachine(tmp_path)
-    made_up.commands["systemctl is-active ModemManager.service"] = "active\n"
-    assert (await made_up.run_checks())["serial_port_free"].outcome is Outcome.NOTE
-    made_up.write("etc/udev/rules.d/60-tsgt.rules", "")
-    assert (await made_up.run_checks())["serial_port_free"].outcome is Outcome.OK
+    fake = FakeMachine(tmp_path)
+    fake.commands["systemctl is-active ModemManager.service"] = "active\n"
+    assert (await fake.run_checks())["serial_port_free"].outcome is Outcome.NOTE
+    fake.write("etc/udev/rules.d/60-tsgt.rules", "")
+    assert (await fake.run_checks())["serial_port_free"].outcome is Outcome.OK
 
 
 @pytest.mark.parametrize(
@@ -104,9 +104,9 @@ async def test_modem_manager_is_a_note_without_udev_rules(tmp_path: Path) -> Non
 )
 async def test_long_latency_timer_fails(tmp_path: Path, timer_ms: int | None, outcome: Outcome) -> None:
     """FTDI adapters have 16 ms by default; others have no timer."""
-    made_up = FakeMachine(tmp_path)
-    made_up.latency_timer_ms = timer_ms
-    found = (await made_up.run_checks())["latency_timer"]
+    fake = FakeMachine(tmp_path)
+    fake.latency_timer_ms = timer_ms
+    found = (await fake.run_checks())["latency_timer"]
     assert found.outcome is outcome
     if outcome is Outcome.FAILED:
         assert "/sys/bus/usb-serial/devices/ttyUSB0/latency_timer" in found.detail

@@ -82,15 +82,13 @@ class _Candidate:
     "--min-separation-mm",
     type=FiniteRange(10, 10_000),
     default=300.0,
-    show_default=True,
-    help="Minimum distance of two prisms in the envelope, so that instruments can tell them apart.",
+    help="Minimum distance of two prisms in the envelope, so that instruments can distinguish them.",
 )
 @click.option(
     "--objective",
     "criterion",
     type=click.Choice(["rotation", "position"]),
     default="rotation",
-    show_default=True,
     help="Accuracy to optimise.",
 )
 @click.option(
@@ -99,10 +97,9 @@ class _Candidate:
     type=(float, float, float),
     metavar="X Y Z",
     default=(0.0, 0.0, 0.0),
-    show_default=True,
     help="Point whose position accuracy counts, in the robot frame in m, for example of a sensor.",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the search.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the search.")
 @figure_option
 @json_option
 def layout_command(
@@ -175,10 +172,7 @@ def layout_command(
                 "stances": len(robot_poses.position_m),
                 "ranking": [each.name for each in candidates],
                 "layouts": {
-                    c.name: {
-                        "prisms": dict(zip(slots, c.layout.tolist(), strict=True)),
-                        **_keys(c.figures),
-                    }
+                    c.name: {"prisms": dict(zip(slots, c.layout.tolist(), strict=True)), **_keys(c.figures)}
                     for c in candidates
                 },
                 "stations_at_m": {

@@ -35,14 +35,12 @@ _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in 
     "--noise-mm-max",
     type=FiniteRange(0, 10_000),
     default=400.0,
-    show_default=True,
     help="Largest noise: one sigma per coordinate of each prism.",
 )
 @click.option(
     "--step-mm",
     type=FiniteRange(0, 10_000, min_open=True),
     default=4.0,
-    show_default=True,
     help="Step between noise levels, starting at 0.",
 )
 @click.option(
@@ -51,14 +49,12 @@ _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in 
     "samples",
     type=click.IntRange(2, 1_000_000),
     default=1000,
-    show_default=True,
     help="Poses per noise level.",
 )
 @click.option(
     "--inter-prism-mm",
     type=FiniteRange(0, 10_000, min_open=True),
     default=10.0,
-    show_default=True,
     help="Mean error of the distances between prisms, as from `tsgt evaluate`, to convert to pose errors.",
 )
 @click.option(
@@ -73,7 +69,7 @@ _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in 
     metavar="X Y Z",
     help="Point whose position error is studied, in the robot frame in m.  [default: centroid of the prisms]",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the noise.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the noise.")
 @figure_option
 @json_option
 def perturbation_command(

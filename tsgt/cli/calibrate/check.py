@@ -61,7 +61,6 @@ if TYPE_CHECKING:
     "--limit-mm",
     type=FiniteRange(min=0),
     default=0.0,
-    show_default=True,
     help="Tolerated movement; movement within the noise is always tolerated.",
 )
 @json_option

@@ -38,17 +38,12 @@ KEYS = "Enter measures, s skips, r repeats the last one (r 3: target 3, r 2 3: o
     help="File of targets to write (.csv); an existing one is continued.",
 )
 @click.option(
-    "--target-count",
-    type=click.IntRange(min=3),
-    default=6,
-    show_default=True,
-    help="Number of targets, numbered from 1.",
+    "--target-count", type=click.IntRange(min=3), default=6, help="Number of targets, numbered from 1."
 )
 @click.option(
     "--repeats",
     type=click.IntRange(min=1),
     default=1,
-    show_default=True,
     help="Measurements of each target by each station; 2 for both faces.",
 )
 @constant_option(

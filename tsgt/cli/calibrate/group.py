@@ -52,7 +52,6 @@ calibrate.add_command(motion)
     "--weights",
     type=click.Choice(["model", "none"]),
     default="model",
-    show_default=True,
     help="Weight targets by the noise of both instruments, or equally (the paper's method).",
 )
 @click.option("--levelled", is_flag=True, help="Solve heading and position only: all stations are levelled.")

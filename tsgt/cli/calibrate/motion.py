@@ -13,13 +13,7 @@ from tsgt.analysis.calibration import calibrate_recording
 from tsgt.analysis.formats import write_prism_layout, write_station_frames
 from tsgt.cli.model_options import add_options
 from tsgt.cli.options import FiniteRange, OutputFile, json_option, keep_going_option, recording_argument
-from tsgt.cli.output import (
-    CHECK_FAILED,
-    print_json,
-    print_table,
-    refuse_overwrite,
-    report_problem,
-)
+from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
 from tsgt.geometry.calibration import SetupPrior, unobservable_directions
 from tsgt.recording import load_recording
 
@@ -50,39 +44,25 @@ _SIGMAS = {
     "frames",
     type=click.Choice(["known", "unknown"]),
     default="known",
-    show_default=True,
     help="Refine the recorded frames, or solve them from the motion alone.",
 )
 @click.option(
     "--dof",
     type=click.Choice(["6", "4"]),
     default="6",
-    show_default=True,
     help="Degrees of freedom of a station; 4: heading and position of levelled stations.",
 )
-@click.option(
-    "--latency/--no-latency",
-    default=True,
-    show_default=True,
-    help="Estimate latencies relative to station 1.",
-)
+@click.option("--latency/--no-latency", default=True, help="Estimate latencies relative to station 1.")
 @click.option("--estimate-prisms", is_flag=True, help="Estimate the prism positions as well.")
 @add_options(
     *(
-        click.option(
-            name,
-            type=FiniteRange(min=0, min_open=True, max=1e6),
-            default=default,
-            show_default=True,
-            help=text,
-        )
+        click.option(name, type=FiniteRange(min=0, min_open=True, max=1e6), default=default, help=text)
         for name, (default, text) in _SIGMAS.items()
     )
 )
 @click.option(
     "--held-out/--no-held-out",
     default=True,
-    show_default=True,
     help="Compute the held-out prediction error: five more calibrations, each without a fifth of the measurements.",
 )
 @click.option(

@@ -56,7 +56,6 @@ LISTED_OUTLIERS = 10
     "--align",
     type=click.Choice(["none", "translation", "rigid"]),
     default="none",
-    show_default=True,
     help="With --reference: print errors after this alignment as well, and what it hides.",
 )
 @click.option(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import click
@@ -44,7 +45,7 @@ def key_command(file: Path) -> None:
     replayed packets.
     """
     write_key(file)
-    click.echo(f"""{file}: a new key for all radios of one mission. Whoever has it can take part: keep it secret.
+    click.echo(f"""{file}: a new key for all radios of one mission. Anybody who has it can take part: keep it secret.
 
 On each machine of the mission, for the daemon's user:
   sudo install -o tsgt -g tsgt -m 600 {file.name} /etc/tsgt/radio.key
@@ -71,16 +72,7 @@ def airtime(*, modem: Modem, payload_bytes: int, as_json: bool) -> None:
     if a symbol is longer than 16 ms. The bit rate is that of the payload alone.
     """
     low_data_rate = low_data_rate_required(modem.spreading_factor, modem.bandwidth_hz)
-    airtime_ms = (
-        airtime_us(
-            payload_bytes,
-            spreading_factor=modem.spreading_factor,
-            bandwidth_hz=modem.bandwidth_hz,
-            coding_rate=modem.coding_rate,
-            preamble_symbols=modem.preamble_symbols,
-        )
-        / 1000
-    )
+    airtime_ms = airtime_us(payload_bytes, **asdict(modem)) / 1000
     after_preamble = payload_symbols(
         payload_bytes,
         spreading_factor=modem.spreading_factor,

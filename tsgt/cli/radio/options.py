@@ -38,14 +38,7 @@ def modem_options(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(modem=Modem(bandwidth_hz=bandwidth_khz, **fields), **given)
 
     return add_options(
-        model_option(
-            ModemConfig,
-            "spreading_factor",
-            "--sf",
-            default=9,
-            show_default=True,
-            help="Spreading factor.",
-        ),
+        model_option(ModemConfig, "spreading_factor", "--sf", default=9, help="Spreading factor."),
         model_option(ModemConfig, "bandwidth_khz", type=float, callback=_bandwidth_hz),
         model_option(ModemConfig, "coding_rate"),
         model_option(ModemConfig, "preamble_symbols", "--preamble"),

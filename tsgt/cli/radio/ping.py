@@ -66,7 +66,6 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
     "payload_bytes",
     type=click.IntRange(MIN_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES),
     default=34,
-    show_default=True,
     help="Length of request and reply in bytes.",
 )
 @click.option(
@@ -91,27 +90,16 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
     help="Transmit power.  [default: that of --region, else 2, which suffices within a building]",
 )
 @click.option(
-    "--sync-word",
-    callback=_byte,
-    default="0x34",
-    show_default=True,
-    help="Sync word, one byte, the same on both sides.",
+    "--sync-word", callback=_byte, default="0x34", help="Sync word, one byte, the same on both sides."
 )
 @wiring_options
 @click.option(
     "--distance-m",
     type=click.FloatRange(1, 1e6),
     default=100.0,
-    show_default=True,
     help="Distance of simulated radios in free space.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Seed of the simulation.",
-)
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the simulation.")
 @json_option
 def ping_command(
     *,
@@ -158,7 +146,7 @@ def ping_command(
         _answer(settings, wiring, count=count, as_json=as_json)
         return 0
 
-    airtime_ms = _airtime_ms(payload_bytes, modem)
+    airtime_ms = airtime_us(payload_bytes, **dataclasses.asdict(modem)) / 1000
     exchanges: list[Exchange] = []
 
     async def session(radio: SX127x, clock: Clock) -> None:
@@ -190,12 +178,12 @@ def ping_command(
                 "received": summary.received,
                 "loss": summary.loss,
                 "late": summary.late,
-                "foreign": summary.unknown,
+                "unknown_packets": summary.unknown,
                 "crc_errors": statistics.crc_errors,
                 "lost_edges": statistics.lost_edges,
                 "packets_per_s": summary.packets_per_s,
-                "here": _strength(summary.local),
-                "there": _strength(summary.remote),
+                "here": summary.local and summary.local._asdict(),
+                "there": summary.remote and summary.remote._asdict(),
                 "round_trip_ms": _times(summary.round_trip_ns),
                 "turnaround_ms": _times(summary.turnaround_ns),
             }
@@ -240,10 +228,10 @@ def _answer(settings: LoRaSettings, wiring: Wiring, *, count: int | None, as_jso
             {
                 "answered": summary.replied,
                 "repeated": summary.repeated,
-                "foreign": summary.unknown,
+                "unknown_packets": summary.unknown,
                 "crc_errors": statistics.crc_errors,
                 "lost_edges": statistics.lost_edges,
-                "here": _strength(summary.signal),
+                "here": summary.signal and summary.signal._asdict(),
                 "turnaround_ms": _times(summary.turnaround_ns),
             }
         )
@@ -281,17 +269,8 @@ def _on_simulation(
     # Imported here, so that the small computer of a station does not load numpy.
     import numpy as np
 
-    from tsgt.simulation.kernel import (
-        VirtualClock,
-        VirtualTimeline,
-        run_virtual,
-    )
-    from tsgt.simulation.lora import (
-        Air,
-        LinkModel,
-        LogDistanceLoss,
-        simulated_radio,
-    )
+    from tsgt.simulation.kernel import VirtualClock, VirtualTimeline, run_virtual
+    from tsgt.simulation.lora import Air, LinkModel, LogDistanceLoss, simulated_radio
 
     timeline, clock, rng = VirtualTimeline(), VirtualClock(0), np.random.default_rng(seed)
     places = {"here": (0.0, 0.0, 0.0), "there": (distance_m, 0.0, 0.0)}
@@ -320,10 +299,6 @@ async def _drain(answers: AsyncIterator[Response]) -> None:
         pass
 
 
-def _airtime_ms(payload_bytes: int, modem: Modem) -> float:
-    return airtime_us(payload_bytes, **dataclasses.asdict(modem)) / 1000
-
-
 def _exchange_line(exchange: Exchange) -> str:
     if exchange.reply is None or exchange.round_trip_ns is None:
         return f"{exchange.number:5d}  no reply"
@@ -337,10 +312,6 @@ def _response_line(result: Response) -> str:
     if result.turnaround_ns is None:
         return f"{result.number:5d}  repeated, {_strength_text(result.signal)}"
     return f"{result.number:5d}  replied after {result.turnaround_ns / 1e6:.3f} ms, {_strength_text(result.signal)}"
-
-
-def _strength(strength: SignalStrength | None) -> dict[str, float] | None:
-    return None if strength is None else strength._asdict()
 
 
 def _strength_text(strength: SignalStrength | None) -> str:

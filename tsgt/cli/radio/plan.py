@@ -83,19 +83,9 @@ class _Row:
 @click.option("--stations", type=click.IntRange(1, 16), required=True, help="Number of stations.")
 @modem_options
 @click.option(
-    "--rate-hz",
-    type=FiniteRange(0.01, 100),
-    default=2.5,
-    show_default=True,
-    help="Measurement rate of each instrument.",
+    "--rate-hz", type=FiniteRange(0.01, 100), default=2.5, help="Measurement rate of each instrument."
 )
-@click.option(
-    "--loss",
-    type=FiniteRange(0, 0.9),
-    default=0.0,
-    show_default=True,
-    help="Probability that a packet is lost.",
-)
+@click.option("--loss", type=FiniteRange(0, 0.9), default=0.0, help="Probability that a packet is lost.")
 @click.option("--region", type=click.Choice(list(REGIONS)), help="Region whose legal limits apply.")
 @model_option(
     ModemConfig, "frequency_mhz", help="Carrier frequency.  [default: a channel of the region, or 905]"
@@ -103,13 +93,7 @@ class _Row:
 @click.option(
     "--power-dbm", type=int, help="Transmit power, 2 to 17 or 20.  [default: that of the region, or 2]"
 )
-@click.option(
-    "--distance-m",
-    type=FiniteRange(1, 1e6),
-    default=1000.0,
-    show_default=True,
-    help="Distance for the link margin.",
-)
+@click.option("--distance-m", type=FiniteRange(1, 1e6), default=1000.0, help="Distance for the link margin.")
 @model_option(ScenarioRadioConfig, "path_loss_exponent", default=3.0)
 @model_option(
     ScenarioRadioConfig,
@@ -155,14 +139,7 @@ def plan_command(
         power_dbm = MIN_POWER_DBM
         if region is not None:
             power_dbm = preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=modem.bandwidth_hz)
-    settings = LoRaSettings(
-        frequency_hz=frequency_hz,
-        spreading_factor=modem.spreading_factor,
-        bandwidth_hz=modem.bandwidth_hz,
-        coding_rate=modem.coding_rate,
-        preamble_symbols=modem.preamble_symbols,
-        power_dbm=power_dbm,
-    )
+    settings = LoRaSettings(frequency_hz=frequency_hz, power_dbm=power_dbm, **asdict(modem))
     spoken: MasterProtocol = _CLASSIC
     if protocol == "superframe":
         spoken = _SUPERFRAME.model_copy(
@@ -223,12 +200,11 @@ def plan_command(
 
 
 def _figures(cycle: CycleEstimate) -> dict[str, Any]:
-    figures = asdict(cycle)
     return {
-        "cycle_ms": figures["cycle_ms"],
-        "rate_hz": figures["rate_hz"],
-        "age_ms": {"p50": figures["age_p50_ms"], "p99": figures["age_p99_ms"]},
-        "duty_cycle": {"master": figures["master_duty"], "station": figures["station_duty"]},
+        "cycle_ms": cycle.cycle_ms,
+        "rate_hz": cycle.rate_hz,
+        "age_ms": {"p50": cycle.age_p50_ms, "p99": cycle.age_p99_ms},
+        "duty_cycle": {"master": cycle.master_duty, "station": cycle.station_duty},
     }
 
 

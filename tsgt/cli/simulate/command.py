@@ -53,7 +53,6 @@ protocol_option = click.option(
     "--protocol",
     type=click.Choice(["superframe", "classic"]),
     default="superframe",
-    show_default=True,
     help=SimulationOptions.model_fields["protocol"].description,
 )
 
@@ -67,7 +66,6 @@ protocol_option = click.option(
         "duration_s",
         "--duration",
         default=None,
-        show_default=False,
         help="Duration of the measurements in s.  [default: that of the scenario]",
     ),
     click.option(
@@ -80,7 +78,6 @@ protocol_option = click.option(
         "loss_probability",
         "--loss",
         default=None,
-        show_default=False,
         help="Probability that a packet is lost.  [default: that of the scenario]",
     ),
     model_option(SimulationOptions, "drift_ppm"),
@@ -90,7 +87,6 @@ protocol_option = click.option(
         ClassicMasterConfig,
         "clock_filter",
         default=None,
-        show_default=False,
         help="Clock filter of the master; protocol classic only.  [default: regression]",
     ),
     model_option(SimulationOptions, "station_software"),
@@ -117,14 +113,12 @@ protocol_option = click.option(
         "faults_text",
         metavar="NAMES",
         default="none",
-        show_default=True,
         help=f"Inject faults drawn from the seed: all, or names separated by commas: {', '.join(FaultKind)}.",
     ),
     model_option(
         PipelineConfig,
         "estimator",
         default=None,
-        show_default=False,
         help="Estimator of the master.  [default: that of the scenario]",
     ),
     model_option(SimulationOptions, "seed"),

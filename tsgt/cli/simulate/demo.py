@@ -71,7 +71,6 @@ class Result:
     "duration_s",
     "--duration",
     default=None,
-    show_default=False,
     help="Duration in s from the first pose.  [default: 30, or that of --scenario]",
 )
 @click.option("--socket", "socket_path", type=path_type, help="UNIX socket of the pose stream.")
@@ -144,12 +143,7 @@ def demo(
 
 
 def _run(
-    scenario: ScenarioConfig,
-    files: DemoFiles,
-    output: Path | None,
-    *,
-    duration_s: float,
-    seed: int,
+    scenario: ScenarioConfig, files: DemoFiles, output: Path | None, *, duration_s: float, seed: int
 ) -> Result:
     """Run a demonstration to its end or to Ctrl-C."""
     clock = SystemClock()

@@ -44,7 +44,7 @@ def test_perturbation_study_as_json(tsgt: Tsgt) -> None:
         assert {"position_norm_mean_mm", "rotation_norm_mean_rad", "inter_prism_mean_mm"} < set(found)
         assert all(len(found[key]) == 3 for key in AXES)
     few, per_mm = study["at_mm"]["8"], study["first_order_per_mm"]
-    # 1000 draws tell a spread to 2.2 %, one sigma.
+    # 1000 samples determine a standard deviation to 2.2 %, one sigma.
     np.testing.assert_allclose(few["position_std_mm"], 8 * np.array(per_mm["position_std_mm"]), rtol=0.09)
     np.testing.assert_allclose(few["euler_std_rad"], 8 * np.array(per_mm["euler_std_rad"]), rtol=0.09)
 

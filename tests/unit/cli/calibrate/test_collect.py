@@ -422,7 +422,7 @@ def test_check_of_unknown_target_or_station_is_rejected(tsgt: Tsgt, tmp_path: Pa
     assert (done.code, "holds no target 7" in done.err) == (1, True)
     done = tsgt(*common, "--station", 4)
     assert (done.code, "no station 4" in done.err) == (2, True)
-    # Its radio has no air to be on.
+    # Its simulated radio has no air server.
     done = tsgt(*common)
     assert (done.code, "stop it first" in done.err) == (1, True)
     done = tsgt(

@@ -228,13 +228,13 @@ def test_outlier_is_listed(tsgt: Tsgt, recording: Path) -> None:
     lines[40] = json.dumps(wrong)
     recording.write_text("\n".join([*lines, ""]), encoding="utf-8")
     outcome = tsgt("evaluate", recording, "--no-held-out", "--json").json()
-    (stray,) = outcome["outliers"]
-    assert (stray["station"], stray["prism"], stray["stamp_ns"]) == (
+    (outlier,) = outcome["outliers"]
+    assert (outlier["station"], outlier["prism"], outlier["stamp_ns"]) == (
         wrong["station"],
         wrong["prism"],
         wrong["stamp_ns"],
     )
-    assert stray["missed_mm"] == pytest.approx(1000.0, abs=10.0)
+    assert outlier["missed_mm"] == pytest.approx(1000.0, abs=10.0)
 
 
 def test_export_keeps_recorded_poses(tsgt: Tsgt, recording: Path) -> None:

@@ -56,7 +56,7 @@ class Made(NamedTuple):
 
 
 def stop_and_go(time_s: float) -> Motion:
-    """Stand for 5 s, then drive a bend."""
+    """Remain stationary for 5 s, then drive a bend."""
     return driving(max(0.0, time_s - 5.0))
 
 
@@ -86,7 +86,7 @@ def findings(recording: Path, **options: Any) -> Findings:
     return collect_findings(load_recording(recording), recording, **options)
 
 
-def told(found: Findings) -> str:
+def report_text(found: Findings) -> str:
     """Everything that a report says in sentences."""
     return "\n".join(
         [v.text for v in verdicts(found)] + [text for section in sections(found) for text in section.text]
@@ -183,8 +183,8 @@ def test_report_of_one_station(tsgt: Tsgt, tmp_path: Path) -> None:
 def test_report_without_stationary_interval(tmp_path: Path) -> None:
     """The figure of stationary distances says so."""
     found = findings(recorded(tmp_path, driving))
-    assert "never stationary" in told(found)
-    assert "There is no stationary interval of 3 s or more" in told(found)
+    assert "never stationary" in report_text(found)
+    assert "There is no stationary interval of 3 s or more" in report_text(found)
     drawn(found, tmp_path, "distances", "distances_over_time")
 
 
@@ -192,7 +192,7 @@ def test_report_of_a_stationary_robot(tmp_path: Path) -> None:
     """Its errors are plotted against almost no motion, or not at all."""
     found = findings(recorded(tmp_path, at_rest))
     drawn(found, tmp_path, "map", "trajectory", "estimators_apart")
-    assert "never stationary" not in told(found)
+    assert "never stationary" not in report_text(found)
 
 
 def test_report_with_a_reference_of_another_day(tmp_path: Path) -> None:
@@ -200,8 +200,8 @@ def test_report_with_a_reference_of_another_day(tmp_path: Path) -> None:
     reference = tmp_path / "other.tum"
     reference.write_text("1600000000 0 0 0 0 0 0 1\n1600000100 0 0 0 0 0 0 1\n", encoding="utf-8")
     found = findings(recorded(tmp_path), reference=read_tum(reference))
-    assert "nothing was compared" in told(found)
-    assert "it covers 2020-09-13" in told(found)
+    assert "nothing was compared" in report_text(found)
+    assert "it covers 2020-09-13" in report_text(found)
     assert report_numbers(found)["compared"] == 0
 
 
@@ -218,10 +218,11 @@ def test_odometry_of_another_day_is_not_used(tmp_path: Path) -> None:
     """The report says that it does not cover the drive."""
     other_day = (1_600_000_000_000_000_000, 1_600_000_100_000_000_000)
     found = findings(recorded(tmp_path), stationary_ns=[other_day])
-    assert "According to the odometry, the robot was stationary before or after this recording only" in told(
-        found
+    assert (
+        "According to the odometry, the robot was stationary before or after this recording only"
+        in report_text(found)
     )
-    assert "stationary from 2020-09-13" in told(found)
+    assert "stationary from 2020-09-13" in report_text(found)
     assert report_numbers(found)["still_s"] == 0.0
 
 
@@ -232,7 +233,7 @@ def test_short_recording_gets_no_good_verdict(tmp_path: Path) -> None:
     late_ns = 1_700_000_003_000_000_000
     kept = [line for line in lines if json.loads(line).get("stamp_ns", 0) < late_ns or "sequence" not in line]
     recording.write_text("".join(kept), encoding="utf-8")
-    said = told(findings(recording))
+    said = report_text(findings(recording))
     assert "too few measurements to estimate motion prior and noise scale" in said
     assert "consistent with their noise" not in said
 
@@ -252,7 +253,7 @@ def test_stations_without_common_time_have_no_motion(tmp_path: Path) -> None:
         < begins_s[record["station"]] + 3
     ]
     recording.write_text("".join(kept), encoding="utf-8")
-    said = told(findings(recording))
+    said = report_text(findings(recording))
     assert "At no time were all prisms measured without a gap" in said
     assert "never stationary" not in said
 

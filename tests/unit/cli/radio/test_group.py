@@ -94,7 +94,12 @@ def test_ping_on_simulated_radios(tsgt: Tsgt) -> None:
     assert outcome.code == 0
     summary = outcome.json()
     assert (summary["sent"], summary["received"], summary["loss"]) == (20, 20, 0.0)
-    assert (summary["late"], summary["foreign"], summary["crc_errors"], summary["lost_edges"]) == (0, 0, 0, 0)
+    assert (summary["late"], summary["unknown_packets"], summary["crc_errors"], summary["lost_edges"]) == (
+        0,
+        0,
+        0,
+        0,
+    )
     # 2 dBm less 91.6 dB of free space over 1 km at 905 MHz
     assert summary["here"]["rssi_dbm"] == pytest.approx(-89.6, abs=1.5)
     assert summary["there"]["rssi_dbm"] == pytest.approx(-89.6, abs=1.5)
@@ -185,7 +190,7 @@ def test_answering_on_hardware(tsgt: Tsgt, bench: Bench) -> None:
     outcome = tsgt("radio", "ping", "--answer", "--frequency-mhz", 905, "--count", 3, "--json")
     assert outcome.code == 0
     summary = outcome.json()
-    assert (summary["answered"], summary["repeated"], summary["foreign"]) == (3, 0, 1)
+    assert (summary["answered"], summary["repeated"], summary["unknown_packets"]) == (3, 0, 1)
     assert summary["turnaround_ms"]["median"] < 1
 
 

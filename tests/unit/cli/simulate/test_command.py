@@ -80,7 +80,7 @@ def test_recording_and_truth_are_written(tsgt: Tsgt, tmp_path: Path) -> None:
     )
     assert result.code == 0
     kept = load_recording(recording)
-    # The run goes on for a few seconds in which what is under way arrives.
+    # The drain after the mission adds some measurements.
     assert len(kept.measurements) >= result.json()["stations"]["1"]["delivered"] > 0
     rows = np.loadtxt(truth)
     assert rows.shape == (401, 8)

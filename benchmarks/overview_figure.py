@@ -54,7 +54,7 @@ def main() -> None:
     right.set_ylabel("position error at the prisms' centroid in mm")
     right.set_xlim(FROM_S, UNTIL_S)
     right.set_ylim(0, None)
-    right.legend(loc="upper right", frameon=False)
+    right.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False)
     for axes in (left, right):
         axes.grid(alpha=0.25, lw=0.5)
         axes.spines[["top", "right"]].set_visible(False)

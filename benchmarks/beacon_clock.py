@@ -41,7 +41,7 @@ class Row:
     late_p99: float | None
     bound_p50: float
     bound_p99: float
-    told: int
+    times: int
     broken: int
     nearest_to_bound: float
 
@@ -57,14 +57,14 @@ def main() -> None:
         print(json.dumps({"rows": [asdict(r) for r in rows], "cost_us": cost_us()}, indent=1))
         return
     print(
-        "| scenario | what happens | live p50 | p99 | late p50 | p99 | bound p50 | p99 | told | broken | at most |"
+        "| scenario | what happens | live p50 | p99 | late p50 | p99 | bound p50 | p99 | times | outside | error/bound |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for r in rows:
         late = "| | " if r.late_p50 is None else f"| {r.late_p50:.0f} | {r.late_p99:.0f} "
         print(
             f"| `{r.scenario}` | {r.summary} | {r.live_p50:.0f} | {r.live_p99:.0f} {late}"
-            f"| {r.bound_p50:.0f} | {r.bound_p99:.0f} | {r.told} | {r.broken} | {r.nearest_to_bound:.2f} |"
+            f"| {r.bound_p50:.0f} | {r.bound_p99:.0f} | {r.times} | {r.broken} | {r.nearest_to_bound:.2f} |"
         )
     print()
     for call, figure in cost_us().items():
@@ -73,10 +73,10 @@ def main() -> None:
 
 def row(scenario: BeaconScenario, seeds: int) -> Row:
     """Run a scenario with seeds 0 and up."""
-    told = [t for seed in range(seeds) for t in run_beacon_scenario(scenario, seed).times]
-    live = [t for t in told if t.live and t.measured_s >= SETTLED_S]
-    late = [t for t in told if not t.live and t.measured_s >= SETTLED_S]
-    ratios = [abs(t.error_us) / t.bound_us for t in told]
+    times = [t for seed in range(seeds) for t in run_beacon_scenario(scenario, seed).times]
+    live = [t for t in times if t.live and t.measured_s >= SETTLED_S]
+    late = [t for t in times if not t.live and t.measured_s >= SETTLED_S]
+    ratios = [abs(t.error_us) / t.bound_us for t in times]
     bounds = np.quantile([t.bound_us for t in live], [0.5, 0.99])
     return Row(
         scenario=scenario.name,
@@ -87,14 +87,14 @@ def row(scenario: BeaconScenario, seeds: int) -> Row:
         late_p99=_error(late, 0.99) if late else None,
         bound_p50=float(bounds[0]),
         bound_p99=float(bounds[1]),
-        told=len(told),
+        times=len(times),
         broken=sum(ratio > 1 for ratio in ratios),
         nearest_to_bound=max(ratios),
     )
 
 
-def _error(told: list[ReportedTime], share: float) -> float:
-    return float(np.quantile([abs(t.rounded_us) for t in told], share))
+def _error(times: list[ReportedTime], share: float) -> float:
+    return float(np.quantile([abs(t.rounded_us) for t in times], share))
 
 
 def cost_us() -> dict[str, float]:

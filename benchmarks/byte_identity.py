@@ -58,6 +58,7 @@ OLD_NAMES = {
     "fence_left": "geofence_exited",
     "fence_entered": "geofence_entered",
     "frame_suspect": "layout_residual_high",
+    "frame_restored": "layout_residual_normal",
     "backlog_left_behind": "measurements_discarded",
     "master_not_understood": "no_valid_beacon",
     "person_needed": "operator_required",

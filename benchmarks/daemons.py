@@ -1,6 +1,6 @@
 """What the daemons cost: CPU and memory of three clients and a master while the demonstration runs in real time.
 
-Run it with ``python benchmarks/run.py daemons [SECONDS]``; ten minutes unless told otherwise. The figures are read from
+Run it with ``python benchmarks/run.py daemons [SECONDS]``; ten minutes by default. The figures are read from
 /proc of each process, so they hold its start as well; the shares are of one core of this machine.
 """
 

@@ -60,7 +60,7 @@ def main() -> None:
     """Run it, print tables; fail if anything was not as it must be."""
     parser = argparse.ArgumentParser(description="Run the daemons for long and look at what they grow by.")
     parser.add_argument("--minutes", type=float, default=30.0, help="how long (default 30)")
-    parser.add_argument("--loss", type=float, default=0.05, help="share of packets not heard (default 0.05)")
+    parser.add_argument("--loss", type=float, default=0.05, help="share of packets lost (default 0.05)")
     parser.add_argument("--seed", type=int, default=0, help="of drive, air and instruments (default 0)")
     parser.add_argument("--json", action="store_true", help="the result as JSON")
     arguments = parser.parse_args()

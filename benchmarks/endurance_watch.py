@@ -104,7 +104,7 @@ class Stream:
 
 
 def lossy_scenario(loss: float) -> ScenarioConfig:
-    """Return the reference scenario with a share of packets that nobody hears."""
+    """Return the reference scenario with packet loss."""
     scenario = ScenarioConfig()
     return scenario.model_copy(update={"radio": scenario.radio.model_copy(update={"loss_probability": loss})})
 

@@ -97,7 +97,7 @@ class Station:
         del self.queue[len(self.queue) - len(sent) :]
         if sent:
             self.newest_ns = max(self.newest_ns, sent[-1])
-            self.missing = len(self.queue)  # as the sequence numbers tell
+            self.missing = len(self.queue)  # by the sequence numbers
 
 
 def grant(station: Station, slot_ns: int, beat: Period, most_bytes: int) -> int:

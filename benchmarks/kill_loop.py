@@ -47,7 +47,7 @@ TOGETHER_SHARE = 0.1
 TORN_SHARE = 1 / 3
 HALF_HEADER = b'{"type":"recording","version":1,"softw'
 LAST_MEASUREMENTS = 5
-"""So many each station makes after the last kill."""
+"""Each station makes this many after the last kill."""
 POLL_S = 0.01
 DRAIN_LIMIT_S = 120.0
 WORLD_S = 7200.0
@@ -230,7 +230,7 @@ class KillLoop:
 
 
 async def _until(condition: Callable[[], bool]) -> None:
-    while not condition():  # noqa: ASYNC110 (neither time nor processes tell by an event)
+    while not condition():  # noqa: ASYNC110 (neither time nor processes signal an event)
         await asyncio.sleep(POLL_S)
 
 

@@ -1,7 +1,7 @@
 """How often a station misses its slot while both cores are busy with something else, and what that costs.
 
-Run it with ``python benchmarks/run.py late_slots [SECONDS]``; two minutes unless told otherwise. The demonstration runs in
-real time, three clients and a master as processes of their own, beside one process per core that does nothing but
+Run it with ``python benchmarks/run.py late_slots [SECONDS]``; two minutes by default. The demonstration runs in
+real time, three clients and a master as separate processes, with one process per core that does nothing but
 count. Late slots are what the clients say of themselves, slots the beacons in the master's recording, and nothing may
 be missing in it that a client has in its journal, but for what was under way when everything ended.
 """

@@ -22,7 +22,7 @@ from tsgt.simulation.world import scenario_world
 
 TIMES = 120
 HIDDEN_S = (1.5, 3.0, 6.0)
-PLAIN = InstrumentModelConfig(tells_prisms_apart=False)
+PLAIN = InstrumentModelConfig(distinguishes_prisms=False)
 SCENARIO = ScenarioConfig(
     stations=tuple(s.model_copy(update={"instrument": PLAIN}) for s in ScenarioConfig().stations)
 )

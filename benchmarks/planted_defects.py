@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 TESTS = Path(__file__).parents[1] / "tests"
 
 SEEDS = 8
-"""So many missions at most."""
+"""Missions per defect at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Defect:
     protocol, estimator, duration_s, drift_ppm
         Of the missions.
     script
-        Runs beside the daemons.
+        Runs while the daemons run.
     test
         A test that sees it, below ``tests``, where no checker can.
     """

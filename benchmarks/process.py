@@ -1,7 +1,7 @@
 """One hour of field work through `tsgt process`, from start-up to the TUM file: CPU time and peak memory.
 
 The recording is what a master would have written: measurements of three stations at 2.5 Hz, the poses that it
-streamed (which `process` reads past and computes again), and nothing else. Beside it, in the same run: what start-up
+streamed (which `process` reads past and computes again), and nothing else. For comparison, in the same run: what start-up
 alone costs, and what reading every line of the file with the standard library's json costs.
 """
 

@@ -28,6 +28,12 @@ def summary(name: str) -> str:
     return docstring.partition("\n")[0]
 
 
+def imports(name: str) -> set[str]:
+    """Return the top-level modules that a benchmark imports."""
+    tree = ast.parse((HERE / f"{name}.py").read_text())
+    return {alias.name for node in tree.body if isinstance(node, ast.Import) for alias in node.names}
+
+
 def main() -> None:
     """Run the benchmark that the command line names."""
     if len(sys.argv) < 2 or sys.argv[1] in {"-h", "--help"}:
@@ -38,6 +44,9 @@ def main() -> None:
     name = sys.argv[1]
     if name not in names():
         sys.exit(f"there is no benchmark {name!r}; `python benchmarks/run.py` lists all")
+    if {"-h", "--help"} & set(sys.argv[2:]) and not {"argparse", "click"} & imports(name):
+        print(ast.get_docstring(ast.parse((HERE / f"{name}.py").read_text())))
+        return
     # Matrices are small: a second thread costs more than it computes, and CPU times would count it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]

@@ -198,7 +198,7 @@ def report(sums: Sums) -> None:
 
 
 def main() -> int:
-    """Run missions for some time, or so many."""
+    """Run missions for some time, or a number of them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

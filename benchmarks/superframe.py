@@ -1,4 +1,4 @@
-"""What the superframe carries, how old it is and how well it is timed, beside the paper's protocol.
+"""What the superframe carries, how old it is and how well it is timed, compared with the paper's protocol.
 
 Run it with ``python benchmarks/run.py superframe``; about five minutes on two cores. Each row is one ``tsgt simulate``, whose
 options stand in it, so that any row can be had alone.

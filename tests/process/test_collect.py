@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 """How long a slow machine may take for what takes a few seconds."""
 
 RADIO = """
@@ -79,7 +79,7 @@ from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import InstrumentModelConfig
 from tsgt.log import configure_logging
 from tsgt.simulation.lora.air_server import AirServer
-from tsgt.simulation.instrument.edm import WITHOUT_PRISM
+from tsgt.simulation.instrument.edm import NON_PRISM_MODES
 from tsgt.simulation.lora.link import LinkModel
 from tsgt.simulation.instrument.pty import PtyLine
 from tsgt.simulation.kernel.timeline import LoopTimeline
@@ -98,7 +98,7 @@ async def main(folder):
         async with PtyLine(instrument, folder / "instrument.tty"):
             print("ready", flush=True)
             while True:
-                if instrument.settings.edm_mode in WITHOUT_PRISM:
+                if instrument.settings.edm_mode in NON_PRISM_MODES:
                     instrument.aim(1)
                 await asyncio.sleep(0.1)
 
@@ -138,7 +138,7 @@ def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
 def wait_for_mode(folder: Path, mode: str) -> None:
     """Wait until the client's instrument is connected and in a mode."""
     found = None
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline_s:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
             if connection.connect_ex(str(folder / "client.sock")) == 0:
@@ -177,7 +177,7 @@ def test_ctrl_c_keeps_measurements_and_returns_to_tracking(folder: Path, *, wait
         assert collect.stdin is not None
         collect.stdin.write(b"\n" if waiting else b"\n\n")
         collect.stdin.flush()
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + TIMEOUT_S
         while not (path.exists() and len(path.read_text().splitlines()) == 2):
             assert time.monotonic() < deadline_s
             time.sleep(0.05)

@@ -24,7 +24,7 @@ from tsgt.model import PolarMeasurement
 from tsgt.recording import load_recording
 from tsgt.recording.journal import load_journal
 
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 """How long a slow machine may take for what takes a few seconds."""
 
 
@@ -54,7 +54,7 @@ class Demo:
 
     def wait_for_poses(self, more_than: int) -> None:
         """Wait until it has reported more valid poses."""
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + TIMEOUT_S
         while self.valid_poses() <= more_than:
             assert time.monotonic() < deadline_s, "".join(self.said)
             assert self.process.poll() is None, "".join(self.said)
@@ -62,7 +62,7 @@ class Demo:
 
     def connect(self, path: Path) -> socket.socket:
         """Connect to the stream as soon as the master listens."""
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + TIMEOUT_S
         while True:
             connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
             try:
@@ -158,7 +158,7 @@ def test_demo_streams_records_and_summarises(start: Start, folder: Path, protoco
 def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signal.Signals) -> None:
     """SIGINT and SIGTERM end demo and daemons with the result so far, exit 0, and no socket left."""
     demo = start("--duration", "60")
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while not demo.pids():
         assert time.monotonic() < deadline_s, "".join(demo.said)
         time.sleep(0.1)
@@ -176,7 +176,7 @@ def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signa
     [
         (("--socket", "{}/" + 90 * "long"), "at most 107 bytes"),
         (("--socket", "{}"), "is not a socket"),
-        (("--output", "{}/none/x.jsonl"), "there is no such folder"),
+        (("--output", "{}/none/x.jsonl"), "no such folder"),
     ],
 )
 def test_invalid_options_fail_at_once(
@@ -187,7 +187,7 @@ def test_invalid_options_fail_at_once(
     assert demo.process.wait(20) in {1, 2}
     assert demo.process.stdout is not None
     assert not demo.process.stdout.read()
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while reason not in "".join(demo.said):
         assert time.monotonic() < deadline_s, "".join(demo.said)
         time.sleep(0.01)
@@ -196,7 +196,7 @@ def test_invalid_options_fail_at_once(
 def test_daemons_end_with_a_killed_demo(start: Start) -> None:
     """SIGKILL of the demo leaves no process."""
     demo = start("--duration", "60")
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while not demo.pids():
         assert time.monotonic() < deadline_s, "".join(demo.said)
         time.sleep(0.1)
@@ -244,7 +244,7 @@ def test_killed_daemons_restart_without_loss(start: Start, folder: Path) -> None
         demo.wait_for_poses(before + 60)
     (made,) = folder.glob("tsgt-demo-*")
     read_by_then = {(station, number) for station in (1, 2, 3) for number in _journalled(made, station)}
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while not read_by_then <= _delivered(made):
         assert time.monotonic() < deadline_s, sorted(read_by_then - _delivered(made))
         time.sleep(0.5)

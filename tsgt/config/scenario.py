@@ -130,7 +130,7 @@ class InstrumentModelConfig(Model):
     """Skew of its own clock; positive: the clock runs fast."""
     angle_delay_ms: Annotated[float, Field(ge=-100, le=100)] = 0.0
     """Delay of its angles after its distance."""
-    tells_prisms_apart: bool = True
+    distinguishes_prisms: bool = True
     """Whether it distinguishes prisms: active prisms with numbers, as the paper's. With passive prisms it locks onto any
     prism when it has lost its own."""
     prediction_s: NotNegative = 2.0

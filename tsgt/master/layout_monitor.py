@@ -72,7 +72,7 @@ class LayoutMonitor(Observer):
         self._alarmed = False
 
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
-        """Take a pose that was published at ``now_ns``; return ``layout_residual_high`` or ``frame_restored`` on a change.
+        """Take a pose that was published at ``now_ns``; return ``layout_residual_high`` or ``layout_residual_normal`` on a change.
 
         Poses of the estimator ``linear`` only: ``continuous`` distorts its trajectory to fit the prisms. Poses that are
         invalid for another reason than their residual are ignored.
@@ -99,7 +99,7 @@ class LayoutMonitor(Observer):
         if ratio < RESTORED_RATIO and self._alarmed:
             self._alarmed = False
             message = f"{self._figures()}; the layout fits again"
-            return [EventRecord(stamp_ns=now_ns, event="frame_restored", message=message)]
+            return [EventRecord(stamp_ns=now_ns, event="layout_residual_normal", message=message)]
         return []
 
     def _alarm(self, now_ns: int) -> EventRecord:

@@ -25,7 +25,7 @@ class ClientDependencies:
     key
         Key shared by the radios of a mission, for protocols with authentication; None: every sender is accepted.
     random_bits
-        Returns a random number of so many bits.
+        Returns a random number with a given number of bits.
     boot
         Identifies the start of this computer from which ``clock`` counts; empty where unknown: no other run is then
         assumed to share the clock.

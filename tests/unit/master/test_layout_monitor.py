@@ -70,7 +70,7 @@ def test_alarm_ends_below_the_hysteresis() -> None:
     steps = [
         (9.0, "layout_residual_high"),
         (5.0, None),
-        (3.0, "frame_restored"),
+        (3.0, "layout_residual_normal"),
         (5.0, None),
         (7.0, "layout_residual_high"),
     ]

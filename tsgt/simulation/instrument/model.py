@@ -244,7 +244,7 @@ class TotalStationModel:
 
     def _select_target(self, prism: int) -> None:
         """Select an active prism by its target ID, if the prisms have one."""
-        self.telescope.target_id = prism if self._model.tells_prisms_apart else None
+        self.telescope.target_id = prism if self._model.distinguishes_prisms else None
 
     def _scenario_fault(self) -> str | None:
         return self._targets.fault_at(self._world_s(self._timeline.now_ns()))

@@ -17,7 +17,9 @@ def follow(path: str) -> None:
         for line in connection.makefile("r", encoding="utf-8"):
             record = json.loads(line)
             if record["type"] == "hello" and record["protocol"] != 1:
-                sys.exit(f"the stream has protocol version {record['protocol']}, this program supports version 1")
+                sys.exit(
+                    f"the stream has protocol version {record['protocol']}, this program supports version 1"
+                )
             if record["type"] == "event":
                 print(f"event: {record['message']}", flush=True)
             # Ignore all other types, also those of later versions.

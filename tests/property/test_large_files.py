@@ -46,7 +46,10 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[int], bytes]]] = {
     "nested": (load_recording, lambda count: recording_bytes() + b"[" * 500 * count + b"\n"),
     "receiver": (read_pos, _pos),
     "trajectory": (read_tum, lambda count: b"".join(b"%d.5 1 2 3 0 0 0 1\n" % k for k in range(10 * count))),
-    "odometry": (read_stationary_intervals, lambda count: b"".join(b"%d,0,0\n" % k for k in range(10 * count))),
+    "odometry": (
+        read_stationary_intervals,
+        lambda count: b"".join(b"%d,0,0\n" % k for k in range(10 * count)),
+    ),
     "targets": (
         read_target_file,
         lambda count: (

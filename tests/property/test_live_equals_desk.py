@@ -117,9 +117,7 @@ def test_post_processing_equals_the_stream_with_two_stations_on_one_prism(
 
 @settings(max_examples=30)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
-def test_timer_does_not_change_the_stream(
-    measurements: list[PolarMeasurement], ticks_ns: list[int]
-) -> None:
+def test_timer_does_not_change_the_stream(measurements: list[PolarMeasurement], ticks_ns: list[int]) -> None:
     """Timer does not change the stream."""
     end_ns = max((m.received_ns for m in measurements), default=START)
     assert live(measurements, ticks_ns, end_ns) == live(measurements, [], end_ns)

@@ -274,7 +274,9 @@ REPLIES = {
         turnaround_us=178_344,
         response=CommandResponse(5, ok=True),
     ),
-    "a single measurement": Reply(single_measurement=SingleMeasurement(6, Status.OK, 12_345_678, 4_100_000, 423_456)),
+    "a single measurement": Reply(
+        single_measurement=SingleMeasurement(6, Status.OK, 12_345_678, 4_100_000, 423_456)
+    ),
 }
 BEACONS = {
     "a beacon": BEACON,

@@ -77,9 +77,7 @@ class Unwritable(io.StringIO):
 
 
 @pytest.mark.parametrize("stderr", [Unwritable(), None], ids=["full disk", "closed"])
-def test_failed_log_write_is_ignored(
-    stderr: io.StringIO | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_log_write_is_ignored(stderr: io.StringIO | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Failed log write is ignored."""
     monkeypatch.setattr(sys, "stderr", stderr)
     configure_logging()

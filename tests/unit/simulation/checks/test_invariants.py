@@ -185,9 +185,7 @@ def _with_modified_journal(
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_unjournalled_delivery_is_detected(
-    result: MissionResult, tmp_path: Path, *, full: bool
-) -> None:
+def test_unjournalled_delivery_is_detected(result: MissionResult, tmp_path: Path, *, full: bool) -> None:
     """Over ``superframe`` a kill is no excuse, only a write error, because delivery waits for the write."""
     station_log = result.station_logs[1]
     delivered = [m for m in result.master_logs[0].measurements if m.station == 1][20]

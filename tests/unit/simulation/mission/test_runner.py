@@ -427,7 +427,9 @@ def test_replay_attack_over_superframe(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_many_stations(tmp_path: Path) -> None:
     """Twelve stations share the channel, and each delivers its measurements."""
-    run = run_mission(tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME)
+    run = run_mission(
+        tmp_path, with_stations(find_scenario("dynamic"), 12), duration_s=30.0, protocol=SUPERFRAME
+    )
     assert check_invariants(run) == []
     for figure in station_figures(run).values():
         assert figure.delivered >= figure.measured - 2  # frames last 2.5 s, and the drain 5 s

@@ -99,7 +99,7 @@ async def main(folder):
             print("ready", flush=True)
             while True:
                 if instrument.settings.edm_mode in NON_PRISM_MODES:
-                    instrument.aim(1)
+                    instrument.aim_at_target(1)
                 await asyncio.sleep(0.1)
 
 configure_logging()

@@ -9,8 +9,8 @@ import click
 
 from tsgt.analysis.calibration import check_station, mean_points
 from tsgt.analysis.formats import read_partial_target_file
+from tsgt.cli.calibrate.operator import Terminal
 from tsgt.cli.calibrate.session import target_session
-from tsgt.cli.operator import Terminal
 from tsgt.cli.options import (
     FiniteRange,
     constant_m,
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.calibration import StationCheck, StationTarget
     from tsgt.analysis.formats import TargetFile, TargetMeasurement
+    from tsgt.cli.calibrate.operator import Operator
     from tsgt.cli.calibrate.session import TargetSession
-    from tsgt.cli.operator import Operator
 
 
 @click.command()

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.analysis.calibration import TargetCollection
+from tsgt.cli.calibrate.operator import Terminal
 from tsgt.cli.calibrate.session import target_session
-from tsgt.cli.operator import Terminal
 from tsgt.cli.options import OutputFile, constant_option, master_config_option
 from tsgt.cli.output import print_table
 from tsgt.clock import SystemClock
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.analysis.calibration import StationTarget
+    from tsgt.cli.calibrate.operator import Operator
     from tsgt.cli.calibrate.session import TargetSession
-    from tsgt.cli.operator import Operator
     from tsgt.geometry.calibration import PointName
 
 KEYS = "Enter measures, s skips, r repeats the last one (r 3: target 3, r 2 3: of station 2), q quits"

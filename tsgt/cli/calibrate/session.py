@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.cli.calibrate.commands import CommandResponse, CommandSender
-    from tsgt.cli.operator import Operator
+    from tsgt.cli.calibrate.operator import Operator
     from tsgt.clock import Clock
     from tsgt.config import MasterConfig
     from tsgt.radio import Command, RadioOpener

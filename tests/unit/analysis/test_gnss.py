@@ -10,8 +10,7 @@ from harness.pos_files import SECOND, Variant, write_pos
 
 from tsgt.analysis.figures import draw_gnss
 from tsgt.analysis.formats import PosFile, read_pos
-from tsgt.analysis.gnss import common_interval, receiver_distances, receivers
-from tsgt.analysis.gnss.baselines import utc_from_gps
+from tsgt.analysis.gnss import common_interval, receiver_distances, receivers, utc_from_gps
 from tsgt.errors import InputFileError, MissingExtraError, RecordingError
 
 if TYPE_CHECKING:

@@ -60,7 +60,9 @@ def check_command(
         assert last.isprintable(), outcome
         assert len(last) < MAX_ERROR_CHARACTERS + len(str(files.folder)), outcome.err
         errors = len(re.findall("^[Ee]rror: ", outcome.err, re.MULTILINE))
-        assert errors == 1 or arguments[:2] == ("config", "check"), outcome  # which reports all errors at once
+        assert errors == 1 or arguments[:2] == ("config", "check"), (
+            outcome
+        )  # which reports all errors at once
     left = set(files.folder.iterdir()) - set(files.contents)
     written = {files.folder / output} if output and outcome.code in (0, 3) else set()
     assert left <= written, outcome

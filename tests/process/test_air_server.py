@@ -45,7 +45,7 @@ from tsgt.simulation.kernel.timeline import LoopTimeline
 SETTINGS = LoRaSettings(frequency_hz=905_000_000, spreading_factor=7, bandwidth_hz=250_000, coding_rate=6)
 
 async def answer_to(radio, question):
-    while True:  # a machine under load may be too late into reception
+    while True:  # under load the radio may start to receive too late
         sent = await radio.transmit(question)
         try:
             async with asyncio.timeout(0.5):
@@ -73,9 +73,9 @@ async def main(path, name):
         try:
             await radio.start(SETTINGS)
             async with asyncio.TaskGroup() as tasks:
-                lost = tasks.create_task(client.wait_lost())
+                disconnected = tasks.create_task(client.wait_disconnected())
                 await {"ask": ask, "answer": answer}[name](radio)
-                lost.cancel()
+                disconnected.cancel()
         finally:
             await radio.close()
 

@@ -131,6 +131,7 @@ def test_damaged_configurations(damage: Damage) -> None:
 
 @examples(15)
 @given(damage=damages, master=st.sampled_from(MASTERS), name=st.sampled_from(sorted(SETUP)))
+@pytest.mark.slow
 def test_damaged_files_named_by_a_configuration(damage: Damage, master: bytes, name: str) -> None:
     """A valid configuration with a damaged set-up file."""
     with Files({**SETUP, name: damage.to([SETUP[name]]), "c.toml": master}) as files:

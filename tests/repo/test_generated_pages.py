@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from tsgt.cli import reference as commands
-from tsgt.cli.main import COMMANDS, cli
+from tsgt.cli.main import COMMANDS, HELP_OPTIONS, cli
 from tsgt.config import reference as configuration
 
 PAGES = Path(__file__).parents[2] / "docs" / "reference"
@@ -25,7 +25,7 @@ def test_configuration_reference_is_fresh() -> None:
 
 def test_every_command_and_option_has_help() -> None:
     """Every sub-command is included."""
-    context = click.Context(cli)
+    context = click.Context(cli, **HELP_OPTIONS)
     for name in COMMANDS:
         command = cli.get_command(context, name)
         assert command is not None

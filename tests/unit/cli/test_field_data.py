@@ -42,6 +42,7 @@ def imported(tsgt: Tsgt, field_data: Path, segment: str, output: Path, *, target
 
 @pytest.mark.parametrize("targets", [False, True], ids=["points", "raw"])
 @pytest.mark.parametrize("segment", SEGMENTS)
+@pytest.mark.slow
 def test_inter_prism_distances(
     tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str, *, targets: bool
 ) -> None:

@@ -10,7 +10,7 @@ import click
 import pytest
 from harness.records import POSE, recording_bytes
 
-from tsgt.cli.main import COMMANDS, GROUPS, cli
+from tsgt.cli.main import COMMANDS, GROUPS, HELP_OPTIONS, cli
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 def groups() -> Iterator[tuple[str, click.Group]]:
     """Yield every group of commands."""
     yield "tsgt", cli
-    context = click.Context(cli)
+    context = click.Context(cli, **HELP_OPTIONS)
     for name in COMMANDS:
         command = cli.get_command(context, name)
         if isinstance(command, click.Group):
@@ -41,14 +41,14 @@ def test_help_groups_the_commands(tsgt: Tsgt) -> None:
 def test_help_of_sub_commands_is_not_cut_off(group: tuple[str, click.Group]) -> None:
     """On a terminal with 80 columns."""
     name, command = group
-    text = command.get_help(click.Context(command, info_name=name, terminal_width=80))
+    text = command.get_help(click.Context(command, info_name=name, terminal_width=80, **HELP_OPTIONS))
     assert not [line for line in text.splitlines() if line.endswith("...") and not line.startswith("Usage")]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_summary_is_the_first_sentence_of_the_help(name: str) -> None:
     """The summary is stored apart, so that ``tsgt --help`` imports no command."""
-    command = cli.get_command(click.Context(cli), name)
+    command = cli.get_command(click.Context(cli, **HELP_OPTIONS), name)
     assert command is not None
     assert (command.help or "").partition("\n")[0] == COMMANDS[name][1]
 

@@ -17,6 +17,7 @@ def test_ten_scenarios() -> None:
 
 
 @pytest.mark.parametrize("name", OBSERVABLE)
+@pytest.mark.slow
 def test_regression_errors_stay_below_a_millisecond(name: str) -> None:
     """In the observable scenarios the 99th percentile is below 1 ms, and all errors within the stated bound."""
     for seed in range(5):

@@ -143,6 +143,7 @@ def displaced(parameters: Parameters, station: int, by_m: tuple[float, float]) -
 
 
 @pytest.mark.parametrize("rate_hz", [2.5, 1.4])
+@pytest.mark.slow
 def test_no_false_alarm_on_the_reference_scenario(rate_hz: float) -> None:
     """Five minutes at the instruments' rate and at what the paper's protocol leaves of it."""
     assert not events(live(*driven(1, rate_hz=rate_hz, duration_s=300.0)))
@@ -161,6 +162,7 @@ def test_no_false_alarm_on_the_published_drives(field_data: Path, segment: str) 
 
 
 @pytest.mark.parametrize(("station", "bearing_deg"), [(1, 0), (1, 120), (2, 90), (2, 0), (3, 200)])
+@pytest.mark.slow
 def test_tripod_moved_by_20_mm_raises_the_alarm(station: int, bearing_deg: int) -> None:
     """Within four minutes, in the reference scenario, for every station and direction."""
     parameters, measurements = driven(1, rate_hz=1.5, duration_s=240.0)

@@ -293,6 +293,7 @@ async def test_keys_skip_repeat_and_reject(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("speaks", BOTH)
 @pytest.mark.parametrize("stop", ["q", None, "cancel"])
+@pytest.mark.slow
 async def test_collection_continues_where_it_stopped(
     tmp_path: Path, stop: str | None, speaks: Speaks
 ) -> None:

@@ -98,6 +98,7 @@ def test_field_data_is_consistent(tsgt: Tsgt, field_data: Path, day: str, weight
 
 @pytest.mark.parametrize(("weights", "limit_mm"), [("none", 1.6), ("model", 1.6)])
 @pytest.mark.parametrize("station", [1, 2, 3])
+@pytest.mark.slow
 def test_falsified_target_is_rejected(
     tsgt: Tsgt, markers: Path, tmp_path: Path, station: int, weights: str, limit_mm: float
 ) -> None:

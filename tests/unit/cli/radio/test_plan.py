@@ -68,6 +68,7 @@ def test_insufficient_capacity_is_a_warning(tsgt: Tsgt) -> None:
     ("region", "frequency_mhz", "exceeds"),
     [("EU868", 869.525, "10 % of any hour"), ("US915", 905.0, "47 CFR 15.249"), ("CA915", 905.0, "RSS-210")],
 )
+@pytest.mark.slow
 def test_region_selects_channel_and_limits(
     tsgt: Tsgt, region: str, frequency_mhz: float, exceeds: str
 ) -> None:

@@ -115,6 +115,7 @@ def test_frame_and_latency_errors_are_recovered() -> None:
     assert np.linalg.norm(missed_m, axis=1).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_covariance_is_consistent() -> None:
     """Over eight drives the mean of chi squared stays in its 99 % band."""
     distances = [calibration_error(with_errors(drive(60.0, seed=seed)), REFINE)[0] for seed in range(8)]

@@ -174,6 +174,7 @@ def test_single_prism_is_tracked_with_growing_covariance(observations: Observati
     assert np.trace(then[0, 3:6, 3:6]) > 10 * np.trace(covariance[0, 3:6, 3:6])
 
 
+@pytest.mark.slow
 def test_nees_is_consistent() -> None:
     """NEES of predicted and smoothed poses over motions drawn from the prior has 6 degrees of freedom."""
     predicted: list[float] = []

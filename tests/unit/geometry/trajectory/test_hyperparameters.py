@@ -53,6 +53,7 @@ def straight_with_one_bend() -> States:
 
 
 @pytest.mark.parametrize("seen", [(), (0,), (0, 2)])
+@pytest.mark.slow
 def test_bend_during_an_outage_stays_within_six_sigmas(seen: tuple[int, ...]) -> None:
     """A robot that drives straight while observed and bends while occluded stays within the covariance of valid poses."""
     motion = straight_with_one_bend()

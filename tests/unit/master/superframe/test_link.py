@@ -238,6 +238,7 @@ async def _in_a_thread_of_its_own(function: object) -> None:
 # --- Radio and stations -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 async def test_radio_failure_continues_the_session(tmp_path: Path) -> None:
     """No station has to join again; nothing is lost or duplicated."""
     async with field_of(tmp_path, superframe=True) as field:
@@ -312,6 +313,7 @@ async def test_backlog_follows_live_data_after_an_outage(tmp_path: Path) -> None
     assert events(field) == ["station_lost 3", "station_recovered 3"]
 
 
+@pytest.mark.slow
 async def test_late_status_is_not_the_present_one(tmp_path: Path) -> None:
     """Late status is not the present one."""
     link = LinkModel()

@@ -312,6 +312,7 @@ class Exchange:
 
 @given(st.data())
 @settings(max_examples=150)
+@pytest.mark.slow
 def test_only_recorded_measurements_are_deleted(data: st.DataObject) -> None:
     """At any loss, restart, full disk and discarded backlog."""
     station, master = Station(), Master()

@@ -342,6 +342,7 @@ def test_superframe_delivers_everything(tmp_path: Path) -> None:
     assert 350 < frame_ms(run) < 450
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_superframe_stream(tmp_path: Path) -> None:
     """Nonces and keys included."""
     one, same, other = (

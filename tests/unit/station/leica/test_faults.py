@@ -91,6 +91,7 @@ async def test_mixed_line_faults_give_no_wrong_reading(seed: int) -> None:
 
 
 @pytest.mark.parametrize("code", sorted(set(ReturnCode)))
+@pytest.mark.slow
 async def test_any_return_code_is_survived(code: ReturnCode) -> None:
     """Measurements and lock queries return it for a while; tracking continues afterwards."""
     async with leica_bench() as day:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tsgt.analysis.formats.csv_table import HORIZONTAL, ZENITH, read_table
-from tsgt.errors import InputFileError
+from tsgt.errors import InputFileError, quoted
 from tsgt.model import PointMeasurement, PolarMeasurement, Status
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def _measurement(row: Row, station: int, count: int) -> Measurement:
         case "point":
             raise row.error("a point needs the columns x_m, y_m and z_m")
         case other:
-            raise row.error(f"type is {other!r}; expected measurement or point")
+            raise row.error(f"type is {quoted(other)}; expected measurement or point")
 
 
 def _distance_m(row: Row) -> float | None:
@@ -117,7 +117,7 @@ def _status(row: Row) -> Status:
         return Status(text)
     except ValueError:
         raise row.error(
-            f"status is {text!r}; expected one of {', '.join(Status)}, or an empty cell"
+            f"status is {quoted(text)}; expected one of {', '.join(Status)}, or an empty cell"
         ) from None
 
 

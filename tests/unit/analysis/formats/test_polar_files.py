@@ -132,6 +132,7 @@ GOOD = f"{START_NS},1,1.0,1.5,20.0,ok"
         ([HEADER, GOOD, GOOD], "line 3: duplicate of .*line 2: station 1, prism 1, same time"),
         ([f"{HEADER},type", f"{GOOD},point"], "line 2: a point needs the columns x_m, y_m and z_m"),
         ([f"{HEADER},type", f"{GOOD},pose"], "line 2: type is 'pose'; expected measurement or point"),
+        ([f"{HEADER},type", f"{GOOD},{'9' * 5000}"], "99...; expected measurement or point"),
     ],
 )
 def test_error_names_the_line(tmp_path: Path, lines: list[str], message: str) -> None:

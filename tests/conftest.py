@@ -25,7 +25,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 FIELD_DATA = Path(__file__).parents[2] / "shared" / "data" / "rts"
 
 # No deadline: how long an example takes depends on the load of the machine.
-settings.register_profile("ci", deadline=None)
+# Derandomised: the same examples in each run; `make fuzz` looks for new ones.
+settings.register_profile("ci", deadline=None, derandomize=True)
 # For `make fuzz`: a failing example is kept in .hypothesis without shrinking, which may take longer than all the rest;
 # the next run without this profile shrinks it.
 settings.register_profile(

@@ -292,8 +292,16 @@ class StationParameters(FiniteNumbers):
     """Scale correction of the slope distance in 1e-6, only what the instrument did not apply itself."""
     latency_ns: int = 0
     """From the measurement to its host stamp, in ns; subtracted from the stamp. Positive: the stamp is late."""
+    vertical_index_rad: float = 0.0
+    """Vertical index error in rad: the zenith angle (first face) that the instrument reads, less the true one."""
+    collimation_rad: float = 0.0
+    """Horizontal collimation error in rad: the line of sight deviates by it clockwise; the horizontal angle reads that
+    over sin(zenith angle) too small."""
     noise: InstrumentNoise = TRACKING_NOISE
     """Noise of one measurement."""
+    noise_scale: Vector3 = (1.0, 1.0, 1.0)
+    """Factors on that noise along the line of sight, horizontally and vertically across it, where estimated. For
+    ``continuous``."""
     targets: tuple[TargetResidual, ...] = ()
     """Targets from which the frame was solved, with their residuals; empty where unknown, and for station 1."""
 
@@ -306,7 +314,12 @@ class StationParameters(FiniteNumbers):
             prism_constant_m=(-10, 10),
             atmospheric_ppm=(-1e4, 1e4),
             latency_ns=(-(10**12), 10**12),
+            vertical_index_rad=(-0.1, 0.1),
+            collimation_rad=(-0.1, 0.1),
         )
+        for factor in self.noise_scale:
+            if not 1e-3 <= factor <= 1e3:
+                raise ValueError(f"a factor of noise_scale is {factor}, expected 0.001 to 1000")
         _check_rotation("T_station1_station", self.T_station1_station)
         _check_coordinates("T_station1_station", (row[3] for row in self.T_station1_station))
 
@@ -405,6 +418,53 @@ class PrismPosition(FiniteNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ReferencePoint(FiniteNumbers):
+    """The frame on the robot whose pose is exported: the robot frame, or one fixed to it."""
+
+    name: str = ROBOT_FRAME
+    """Name of the frame: ``child_frame`` of the poses."""
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    """Its origin in the frame ``robot``, [x, y, z] in m."""
+    orientation_xyzw: Row4 = (0.0, 0.0, 0.0, 1.0)
+    """Rotation that takes its coordinates to the frame ``robot``, as a Hamilton unit quaternion [x, y, z, w]."""
+
+    def __post_init__(self) -> None:
+        """Reject impossible frames."""
+        _check_coordinates("position_m", self.position_m)
+        if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < _ROTATION_TOLERANCE:
+            raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
+        if not self.name or not self.name.isprintable():
+            raise ValueError(f"name holds {self.name!r}, expected a name")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetupCovariance(FiniteNumbers):
+    """Joint covariance of the calibrated set-up, which all poses share: it does not average out over time."""
+
+    components: tuple[str, ...]
+    """What the n rows and columns stand for, each at most once. ``stationK.x``, ``.y``, ``.z``: displacement of the
+    origin of station K in frame ``station1``, in m; ``stationK.rotation_x``, ``.rotation_y``, ``.rotation_z``: rotation of
+    its axes about the fixed axes of frame ``station1`` through that origin, in rad; ``stationK.latency`` in s;
+    ``stationK.vertical_index`` and ``.collimation`` in rad; ``stationK.prism_constant`` in m; ``stationK.range_scale``,
+    dimensionless; ``prismP.x``, ``.y``, ``.z``: in the frame ``robot``, in m."""
+    matrix: tuple[tuple[float, ...], ...]
+    """n rows of n: covariances in products of those units."""
+
+    def __post_init__(self) -> None:
+        """Reject a matrix that is no covariance of the components."""
+        n = len(self.components)
+        if len(set(self.components)) != n:
+            raise ValueError("components holds a name twice")
+        if len(self.matrix) != n or any(len(row) != n for row in self.matrix):
+            raise ValueError(f"matrix is not {n} x {n}, as the components are")
+        for i, row in enumerate(self.matrix):
+            for j, value in enumerate(row):
+                limit = math.sqrt(max(self.matrix[i][i] * self.matrix[j][j], 0.0))
+                if self.matrix[i][i] < 0 or abs(value) > limit * (1 + 1e-6) or value != self.matrix[j][i]:
+                    raise ValueError(f"matrix is no covariance, see row {i + 1}, column {j + 1}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Parameters:
     """Every parameter in force: what post-processing a recording needs."""
 
@@ -415,3 +475,7 @@ class Parameters:
     """One entry per prism."""
     pipeline: PipelineParameters = PipelineParameters()
     """Parameters of the estimators."""
+    reference_point: ReferencePoint = ReferencePoint()
+    """The frame on the robot whose pose is exported."""
+    setup_covariance: SetupCovariance | None = None
+    """Uncertainty of station frames, latencies, instrument errors and prisms; null where unknown: taken as exact."""

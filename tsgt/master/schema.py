@@ -45,6 +45,8 @@ PAGES: dict[Path, tuple[type, ...]] = {
         model.TargetResidual,
         model.InstrumentNoise,
         model.PrismPosition,
+        model.ReferencePoint,
+        model.SetupCovariance,
         model.PipelineParameters,
         model.MotionPrior,
         journal.JournalRecord,

@@ -87,6 +87,9 @@ class PoseRecord(FiniteNumbers):
     covariance: CovarianceOrNone
     """Covariance of the pose, 6x6 row by row, order x, y, z (m), rotation about the fixed axes x, y, z (rad) of
     ``frame``; null when it cannot be computed."""
+    covariance_common: CovarianceOrNone = None
+    """The part of ``covariance`` that all poses share, in the same order: uncertainty of station frames and prisms,
+    which does not average out over time. The rest is random. Null where the set-up's uncertainty is unknown."""
     velocity_mps: PositionOrNone
     """Velocity of the origin of ``child_frame``, [x, y, z] in m/s, in ``frame``; null when it cannot be computed."""
     angular_velocity_radps: PositionOrNone

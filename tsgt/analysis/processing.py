@@ -1,4 +1,4 @@
-"""Poses of a recording, and replacing parts of its parameters before processing."""
+"""Poses of a recording."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from tsgt.analysis.validation import (
     no_valid_pose_message,
     plausible_measurements,
 )
-from tsgt.errors import ConfigError, DegenerateGeometryError, RecordingError
+from tsgt.errors import RecordingError
 from tsgt.estimation import LinearEstimator
-from tsgt.geometry import check_layout
-from tsgt.model import PolarMeasurement, PrismPosition
+from tsgt.model import PolarMeasurement
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from tsgt.estimation import PoseBatch
-    from tsgt.model import Matrix4, Measurement, Parameters, TargetResidual, Vector3
+    from tsgt.model import Measurement
     from tsgt.recording import Recording
 
 Estimator = Literal["linear", "continuous"]
@@ -64,52 +63,6 @@ def with_estimator(recording: Recording, estimator: Estimator) -> Recording:
     return dataclasses.replace(
         recording, parameters=dataclasses.replace(recording.parameters, pipeline=pipeline)
     )
-
-
-def with_frames(parameters: Parameters, frames: Mapping[int, Matrix4], *, path: Path) -> Parameters:
-    """Replace the frames of all stations by ``T_station1_station`` of a set-up file. Raises ConfigError if one is missing."""
-    missing = [s.station for s in parameters.stations if s.station not in frames]
-    if missing:
-        raise ConfigError(
-            f"{path}: stations.{missing[0]}: missing; the recording has this station", path=path
-        )
-    # The recorded target residuals belong to the replaced frames.
-    stations = (
-        dataclasses.replace(s, T_station1_station=frames[s.station], targets=()) for s in parameters.stations
-    )
-    return dataclasses.replace(parameters, stations=tuple(stations))
-
-
-def with_targets(parameters: Parameters, targets: Mapping[int, tuple[TargetResidual, ...]]) -> Parameters:
-    """Replace the target residuals of the stations' frames, by station number."""
-    stations = (dataclasses.replace(s, targets=targets.get(s.station, ())) for s in parameters.stations)
-    return dataclasses.replace(parameters, stations=tuple(stations))
-
-
-def with_latencies(parameters: Parameters, latencies_ns: Mapping[int, int]) -> Parameters:
-    """Replace the latencies (ns, by station number) of the stations that ``latencies_ns`` contains."""
-    stations = (
-        dataclasses.replace(s, latency_ns=latencies_ns.get(s.station, s.latency_ns))
-        for s in parameters.stations
-    )
-    return dataclasses.replace(parameters, stations=tuple(stations))
-
-
-def with_layout(parameters: Parameters, layout: Mapping[int, Vector3], *, path: Path) -> Parameters:
-    """Replace the prism layout by that of a set-up file, in m in the robot frame; prisms that the recording lacks are ignored.
-
-    Raises ConfigError if a prism of the recording has no position in the file, or the layout determines no pose.
-    """
-    missing = [p.prism for p in parameters.prisms if p.prism not in layout]
-    if missing:
-        raise ConfigError(f"{path}: prisms.{missing[0]}: missing; the recording has this prism", path=path)
-    numbers = [p.prism for p in parameters.prisms]
-    try:
-        check_layout([layout[number] for number in numbers], names=numbers)
-    except DegenerateGeometryError as error:
-        raise ConfigError(f"{path}: {error}", path=path, key="prisms") from error
-    prisms = (PrismPosition(prism=number, position_m=layout[number]) for number in numbers)
-    return dataclasses.replace(parameters, prisms=tuple(prisms))
 
 
 def has_raw_angles(measurements: Sequence[Measurement]) -> bool:

@@ -22,6 +22,7 @@ from tsgt.analysis.rts_import import (
     polar_measurements,
     stations_from_targets,
 )
+from tsgt.analysis.setup_replacement import with_calibration
 from tsgt.cli.options import (
     RECORDING_SUFFIXES,
     OutputFile,
@@ -32,7 +33,8 @@ from tsgt.cli.options import (
     path_type,
 )
 from tsgt.cli.output import print_json, refuse_overwrite
-from tsgt.cli.recordings import with_calibration, write_recording
+from tsgt.cli.recordings import write_recording
+from tsgt.config import load_station_calibration
 from tsgt.model import Parameters, StationParameters
 
 if TYPE_CHECKING:
@@ -171,7 +173,9 @@ def import_polar(
         stations = (
             StationParameters(station=k, prism=p, prism_constant_m=constant) for k, p in tracked.items()
         )
-        parameters = with_calibration(Parameters(stations=tuple(stations), prisms=layout), frames)
+        parameters = with_calibration(
+            Parameters(stations=tuple(stations), prisms=layout), load_station_calibration(frames), path=frames
+        )
     write_recording(
         output,
         source=f"import polar: {' '.join(path.name for path in sources)}",

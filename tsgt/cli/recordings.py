@@ -10,18 +10,12 @@ import click
 import numpy as np
 
 import tsgt
-from tsgt.analysis.processing import (
-    has_raw_angles,
-    with_estimator,
-    with_frames,
-    with_latencies,
-    with_layout,
-    with_targets,
-)
+from tsgt.analysis.processing import has_raw_angles, with_estimator
+from tsgt.analysis.setup_replacement import with_calibration, with_layout
 from tsgt.cli.options import path_type
 from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
-from tsgt.config import load_prism_layout, load_station_frames, load_station_latencies, load_target_residuals
+from tsgt.config import load_prism_layout, load_station_calibration
 from tsgt.recording import RecordingHeader, encode_line, load_recording, write_atomically
 
 if TYPE_CHECKING:
@@ -83,18 +77,11 @@ def load(
             raise click.UsageError(
                 f"{path} holds points in the frame of station 1, no raw measurements: --frames has no effect"
             )
-        parameters = with_calibration(parameters, frames)
+        parameters = with_calibration(parameters, load_station_calibration(frames), path=frames)
     if prisms is not None:
         parameters = with_layout(parameters, load_prism_layout(prisms), path=prisms)
     recording = dataclasses.replace(recording, parameters=parameters)
     return recording if estimator is None else with_estimator(recording, estimator)
-
-
-def with_calibration(parameters: Parameters, frames: Path) -> Parameters:
-    """Return parameters with the frames, latencies and target residuals of a station-frames file."""
-    parameters = with_frames(parameters, load_station_frames(frames), path=frames)
-    parameters = with_latencies(parameters, load_station_latencies(frames))
-    return with_targets(parameters, load_target_residuals(frames))
 
 
 def pose_counts(poses: PoseBatch) -> dict[str, Any]:

@@ -6,6 +6,14 @@ The top-level key ``kind`` of a file selects its model: ``client``, ``master``, 
 """
 
 from tsgt.config.base import Model, NoiseConfig
+from tsgt.config.calibration import (
+    PrismLayout,
+    StationCalibration,
+    StationSetup,
+    load_prism_layout,
+    load_station_calibration,
+    setup_covariance,
+)
 from tsgt.config.client import (
     Baud,
     BridgeInstrumentConfig,
@@ -22,10 +30,6 @@ from tsgt.config.files import (
     json_schema,
     load,
     load_any,
-    load_prism_layout,
-    load_station_frames,
-    load_station_latencies,
-    load_target_residuals,
 )
 from tsgt.config.master import (
     FrameWatchConfig,
@@ -87,6 +91,7 @@ __all__ = [
     "OcclusionConfig",
     "PipelineConfig",
     "PressureHpa",
+    "PrismLayout",
     "PrismLayoutFile",
     "ProtocolConfig",
     "RadioConfig",
@@ -96,8 +101,10 @@ __all__ = [
     "SetupConfig",
     "SimulatedRadioConfig",
     "SimulatedStation",
+    "StationCalibration",
     "StationConfig",
     "StationFramesFile",
+    "StationSetup",
     "StreamConfig",
     "SuperframeConfig",
     "SuperframeMasterConfig",
@@ -110,10 +117,9 @@ __all__ = [
     "load",
     "load_any",
     "load_prism_layout",
-    "load_station_frames",
-    "load_station_latencies",
-    "load_target_residuals",
+    "load_station_calibration",
     "noise",
     "parameters",
     "scenario_parameters",
+    "setup_covariance",
 ]

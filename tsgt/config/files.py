@@ -15,14 +15,11 @@ from tsgt.config.master import MasterConfig
 from tsgt.config.scenario import ScenarioConfig
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 from tsgt.errors import ConfigError
-from tsgt.model import TargetResidual
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from pydantic_core import ErrorDetails
-
-    from tsgt.model import Matrix4, Vector3
 
 Config = Annotated[
     ClientConfig | MasterConfig | StationFramesFile | PrismLayoutFile | ScenarioConfig,
@@ -76,54 +73,11 @@ def find_problems(path: Path) -> tuple[Model | None, list[ConfigError]]:
         return None, _problems(path, raw, model, error)
 
 
-def load_station_frames(path: Path) -> dict[int, Matrix4]:
-    """Read ``T_station1_station`` by station number; raises as :func:`load`."""
-    stations = load(path, StationFramesFile).stations
-    return {int(number): entry.T_station1_station for number, entry in stations.items()}
-
-
-def load_station_latencies(path: Path) -> dict[int, int]:
-    """Read latencies in ns by station number, as far as given; raises as :func:`load`."""
-    stations = load(path, StationFramesFile).stations
-    return {
-        int(number): round(entry.latency_ms * 1e6)
-        for number, entry in stations.items()
-        if entry.latency_ms is not None
-    }
-
-
-def load_target_residuals(path: Path) -> dict[int, tuple[TargetResidual, ...]]:
-    """Read target residuals by station number, as far as given; raises as :func:`load`."""
-    stations = load(path, StationFramesFile).stations
-    return {
-        int(number): tuple(
-            TargetResidual(
-                target=fit.target,
-                residual_m=_metres(fit.residual_mm),
-                leave_one_out_m=_metres(fit.leave_one_out_mm),
-            )
-            for fit in entry.targets
-        )
-        for number, entry in stations.items()
-        if entry.targets
-    }
-
-
-def load_prism_layout(path: Path) -> dict[int, Vector3]:
-    """Read the prism positions in the robot frame in m by prism number; raises as :func:`load`."""
-    prisms = load(path, PrismLayoutFile).prisms
-    return {int(number): entry.position_m for number, entry in prisms.items()}
-
-
 def json_schema(kind: str | None = None) -> dict[str, Any]:
     """Return the JSON Schema of one kind of file, or of all kinds."""
     if kind is not None:
         return KINDS[kind].model_json_schema()
     return TypeAdapter[Any](Config).json_schema()
-
-
-def _metres(length_mm: float | None) -> float | None:
-    return None if length_mm is None else length_mm / 1e3
 
 
 def _read(path: Path) -> dict[str, Any]:

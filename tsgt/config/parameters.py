@@ -5,12 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from tsgt.config.files import (
-    load_prism_layout,
-    load_station_frames,
-    load_station_latencies,
-    load_target_residuals,
-)
+from tsgt.config.calibration import load_prism_layout, load_station_calibration, setup_covariance
 from tsgt.errors import ConfigError
 from tsgt.model import (
     ARCSECOND_RAD,
@@ -38,12 +33,11 @@ def parameters(config: MasterConfig) -> Parameters:
     Prisms that no station tracks are omitted: every pose would wait for them. Raises ConfigError if a set-up file is
     invalid, a station has no frame, a prism has no position, or the stations track fewer than three prisms.
     """
-    frames = load_station_frames(config.setup.station_frames)
-    latencies_ns = load_station_latencies(config.setup.station_frames)
-    targets = load_target_residuals(config.setup.station_frames)
-    layout = load_prism_layout(config.setup.prism_layout)
+    calibration = load_station_calibration(config.setup.station_frames)
+    prism_layout = load_prism_layout(config.setup.prism_layout)
+    layout = prism_layout.positions_m
     for station in config.stations:
-        if station.station not in frames:
+        if station.station not in calibration.stations:
             raise ConfigError(
                 f"{config.setup.station_frames}: stations.{station.station}: missing; each station needs a frame",
                 path=config.setup.station_frames,
@@ -64,20 +58,26 @@ def parameters(config: MasterConfig) -> Parameters:
         )
     return Parameters(
         stations=tuple(
-            StationParameters(
-                station=station.station,
-                prism=station.prism,
-                T_station1_station=frames[station.station],
-                prism_constant_m=station.prism_constant_mm / 1e3,
-                atmospheric_ppm=station.atmospheric_ppm,
-                latency_ns=latencies_ns.get(station.station, round(station.latency_ms * 1e6)),
-                noise=noise(station.noise),
-                targets=targets.get(station.station, ()),
+            calibration.stations[station.station].applied(
+                StationParameters(
+                    station=station.station,
+                    prism=station.prism,
+                    prism_constant_m=station.prism_constant_mm / 1e3,
+                    atmospheric_ppm=station.atmospheric_ppm,
+                    latency_ns=round(station.latency_ms * 1e6),
+                    noise=noise(station.noise),
+                )
             )
             for station in config.stations
         ),
         prisms=tuple(PrismPosition(prism=prism, position_m=layout[prism]) for prism in tracked),
         pipeline=pipeline_parameters(config.pipeline),
+        setup_covariance=setup_covariance(
+            calibration.covariance,
+            prism_layout.covariance,
+            station_numbers=(station.station for station in config.stations),
+            prism_numbers=tracked,
+        ),
     )
 
 

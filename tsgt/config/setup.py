@@ -2,12 +2,44 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.base import Model, NotNegative, Number, NumberKey, Place, rigid
-from tsgt.model import Matrix4
+from tsgt.model import Matrix4, SetupCovariance
+
+InstrumentErrorMrad = Annotated[float, Field(ge=-100, le=100)]
+
+_STATION_COMPONENT = re.compile(
+    r"station([1-9][0-9]{0,8})\."
+    r"(x|y|z|rotation_[xyz]|latency|vertical_index|collimation|prism_constant|range_scale)"
+)
+_PRISM_COMPONENT = re.compile(r"prism([1-9][0-9]{0,8})\.[xyz]")
+
+
+class CovarianceTable(Model):
+    """Joint covariance of the calibrated quantities."""
+
+    components: tuple[str, ...]
+    """Quantity of each row and column: `station2.x`, `.y`, `.z` (origin in the frame of station 1, m), `.rotation_x`,
+    `.rotation_y`, `.rotation_z` (about the axes of station 1, rad), `.latency` (s), `.vertical_index`, `.collimation`
+    (rad), `.range_scale` (1), `.prism_constant` (m); `prism1.x`, `.y`, `.z` (in the robot frame, m)."""
+    matrix: tuple[tuple[float, ...], ...]
+    """Covariances, row by row, in products of those units."""
+
+    @model_validator(mode="after")
+    def _is_covariance(self) -> CovarianceTable:
+        SetupCovariance(components=self.components, matrix=self.matrix)
+        return self
+
+
+def _check_components(table: CovarianceTable | None, pattern: re.Pattern[str], numbers: set[str]) -> None:
+    for name in () if table is None else table.components:
+        found = pattern.fullmatch(name)
+        if found is None or found[1] not in numbers:
+            raise ValueError(f"covariance.components: {name} is no quantity of this file")
 
 
 class TargetFit(Model):
@@ -32,6 +64,13 @@ class StationFrame(Model):
     """Targets of the solution, for reports."""
     latency_ms: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     """Latency from the measurement to its timestamp by ``tsgt calibrate motion``; replaces that of the configuration."""
+    vertical_index_mrad: InstrumentErrorMrad | None = None
+    """Vertical index error: the zenith angle that the instrument reads (first face) less the true one. Subtracted from
+    each measurement."""
+    collimation_mrad: InstrumentErrorMrad | None = None
+    """Horizontal collimation error: the line of sight deviates by it clockwise. Subtracted from each measurement."""
+    range_scale_ppm: Annotated[float, Field(ge=-1e4, le=1e4)] | None = None
+    """Scale correction of the slope distance; replaces `atmospheric_ppm` of the configuration."""
 
 
 class StationFramesFile(Model):
@@ -41,6 +80,13 @@ class StationFramesFile(Model):
     """Kind of this file."""
     stations: dict[NumberKey, StationFrame]
     """One table per station, named by its number."""
+    covariance: CovarianceTable | None = None
+    """Uncertainty of frames, latencies and instrument errors; none: unknown."""
+
+    @model_validator(mode="after")
+    def _covariance_is_of_stations(self) -> StationFramesFile:
+        _check_components(self.covariance, _STATION_COMPONENT, set(self.stations))
+        return self
 
 
 class PrismEntry(Model):
@@ -59,3 +105,10 @@ class PrismLayoutFile(Model):
     """Kind of this file."""
     prisms: dict[NumberKey, PrismEntry]
     """One table per prism, named by its number."""
+    covariance: CovarianceTable | None = None
+    """Joint uncertainty of the positions; none: that of `sigma_m`, uncorrelated."""
+
+    @model_validator(mode="after")
+    def _covariance_is_of_prisms(self) -> PrismLayoutFile:
+        _check_components(self.covariance, _PRISM_COMPONENT, set(self.prisms))
+        return self

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from harness.scene import START, driving, stationary_scene
 
-from tsgt.analysis.processing import has_raw_angles, process, with_frames, with_layout
+from tsgt.analysis.processing import has_raw_angles, process
+from tsgt.analysis.setup_replacement import with_calibration, with_layout
+from tsgt.config import PrismLayout, StationCalibration, StationSetup
 from tsgt.errors import ConfigError, RecordingError
-from tsgt.model import PointMeasurement, Status
+from tsgt.model import PointMeasurement, SetupCovariance, Status
 from tsgt.recording import Recording, RecordingHeader
 
 if TYPE_CHECKING:
-    from tsgt.model import Measurement, Parameters
+    from tsgt.model import Measurement, Parameters, Vector3
 
 PATH = Path("field.jsonl")
 SCENE = stationary_scene().moving(driving)
@@ -105,23 +107,49 @@ def test_reason_of_computed_poses_precedes_outages() -> None:
     assert "tilt" in str(error.value)
 
 
-def test_frames_are_replaced_by_station() -> None:
-    """Every station of the recording gets its new frame, everything else is unchanged."""
-    frames = dict.fromkeys((1, 2, 3, 4), SCENE.parameters.stations[0].T_station1_station)
-    replaced = with_frames(SCENE.parameters, frames, path=Path("frames.toml"))
-    assert [s.T_station1_station for s in replaced.stations] == [frames[1]] * 3
+def calibration_of(*numbers: int) -> StationCalibration:
+    """Every station gets the same frame and an index error; ``z`` of stations 2 and 9 are uncertain."""
+    setup = StationSetup(
+        T_station1_station=SCENE.parameters.stations[0].T_station1_station, vertical_index_rad=2e-4
+    )
+    covariance = SetupCovariance(components=("station2.z", "station9.z"), matrix=((4.0, 1.0), (1.0, 9.0)))
+    return StationCalibration(dict.fromkeys(numbers, setup), covariance)
+
+
+def test_calibration_is_replaced_by_station() -> None:
+    """Every station of the recording gets its new frame and instrument errors, everything else is unchanged."""
+    given = calibration_of(1, 2, 3, 4)
+    replaced = with_calibration(SCENE.parameters, given, path=Path("frames.toml"))
+    assert [s.T_station1_station for s in replaced.stations] == [given.stations[1].T_station1_station] * 3
+    assert [s.vertical_index_rad for s in replaced.stations] == [2e-4] * 3
     assert replaced.stations[1].prism_constant_m == SCENE.parameters.stations[1].prism_constant_m
     with pytest.raises(ConfigError, match=r"frames.toml: stations.3: missing"):
-        with_frames(SCENE.parameters, {1: frames[1], 2: frames[2]}, path=Path("frames.toml"))
+        with_calibration(SCENE.parameters, calibration_of(1, 2), path=Path("frames.toml"))
+
+
+def layout_of(positions_m: dict[int, Vector3]) -> PrismLayout:
+    """Return a layout in which ``x`` of prism 1 is uncertain."""
+    return PrismLayout(positions_m, SetupCovariance(components=("prism1.x",), matrix=((1e-6,),)))
 
 
 def test_layout_is_replaced_by_prism() -> None:
     """Every prism of the recording gets its new position."""
     layout = {k: (float(k), float(k * k), 0.0) for k in (1, 2, 3, 4)}
-    replaced = with_layout(SCENE.parameters, layout, path=Path("prisms.toml"))
+    replaced = with_layout(SCENE.parameters, layout_of(layout), path=Path("prisms.toml"))
     assert [(p.prism, p.position_m) for p in replaced.prisms] == [(k, layout[k]) for k in (1, 2, 3)]
     with pytest.raises(ConfigError, match=r"prisms.toml: prisms.2: missing"):
-        with_layout(SCENE.parameters, {1: layout[1]}, path=Path("prisms.toml"))
+        with_layout(SCENE.parameters, layout_of({1: layout[1]}), path=Path("prisms.toml"))
+
+
+def test_covariances_of_stations_and_prisms_are_joined() -> None:
+    """Replacing one keeps the other; stations that the recording lacks are omitted."""
+    layout = {k: (float(k), float(k * k), 0.0) for k in (1, 2, 3)}
+    calibrated = with_calibration(SCENE.parameters, calibration_of(1, 2, 3), path=Path("frames.toml"))
+    both = with_layout(calibrated, layout_of(layout), path=Path("prisms.toml"))
+    joined = SetupCovariance(components=("station2.z", "prism1.x"), matrix=((4.0, 0.0), (0.0, 1e-6)))
+    assert both.setup_covariance == joined
+    again = with_calibration(both, calibration_of(1, 2, 3), path=Path("frames.toml"))
+    assert again.setup_covariance == joined
 
 
 def test_frames_matter_to_raw_angles_only() -> None:
@@ -158,4 +186,4 @@ def test_degenerate_layout_is_rejected() -> None:
     """The message names the file of the layout."""
     layout = {1: (0.0, 0.0, 0.0), 2: (0.0, 0.0, 0.0), 3: (1.0, 0.0, 0.0)}
     with pytest.raises(ConfigError, match=r"^prisms.toml: prisms 1 and 2 are 0.0 mm apart"):
-        with_layout(SCENE.parameters, layout, path=Path("prisms.toml"))
+        with_layout(SCENE.parameters, layout_of(layout), path=Path("prisms.toml"))

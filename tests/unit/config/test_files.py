@@ -14,7 +14,7 @@ from tsgt.config import (
     load,
     load_any,
     load_prism_layout,
-    load_station_frames,
+    load_station_calibration,
 )
 from tsgt.errors import ConfigError
 
@@ -210,7 +210,7 @@ def test_frame_that_is_not_rigid_is_rejected(name: str, tmp_path: Path) -> None:
     path = tmp_path / "frames.toml"
     path.write_text(FRAMES.replace(good, bad, 1))
     with pytest.raises(ConfigError, match=expected) as error:
-        load_station_frames(path)
+        load_station_calibration(path)
     assert "stations." in str(error.value)
 
 
@@ -220,7 +220,12 @@ def test_frame_with_seven_digits_is_accepted(tmp_path: Path) -> None:
     path.write_text(
         FRAMES.replace("0.9063077870366499", "0.9063078").replace("0.42261826174069944", "0.4226183")
     )
-    assert load_station_frames(path)[2][0] == (0.9063078, -0.4226183, 0.0, 2.0)
+    assert load_station_calibration(path).stations[2].T_station1_station[0] == (
+        0.9063078,
+        -0.4226183,
+        0.0,
+        2.0,
+    )
 
 
 def test_layout_with_sigmas_is_accepted(tmp_path: Path) -> None:
@@ -229,7 +234,7 @@ def test_layout_with_sigmas_is_accepted(tmp_path: Path) -> None:
     path.write_text(
         'kind = "prism_layout"\n[prisms.7]\nposition_m = [1, 2.5, 0]\nsigma_m = [0.001, 0.001, 0.002]\n'
     )
-    assert load_prism_layout(path) == {7: (1.0, 2.5, 0.0)}
+    assert load_prism_layout(path).positions_m == {7: (1.0, 2.5, 0.0)}
 
 
 SCENARIO_PROBLEMS = {

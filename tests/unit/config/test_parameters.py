@@ -75,6 +75,53 @@ def test_set_up_files_are_read(folder: Path) -> None:
     assert known.prisms[1].position_m == (0.4844, -0.1759, 1.4167)
 
 
+def test_instrument_errors_and_covariance_are_read(folder: Path) -> None:
+    """Units are converted; the scale replaces that of the configuration; the layout's sigmas join the covariance."""
+    frames = folder / "station_frames.example.toml"
+    errors = "[stations.3]\nvertical_index_mrad = 0.2\ncollimation_mrad = -0.1\nrange_scale_ppm = 4.0\n"
+    table = '[covariance]\ncomponents = ["station3.z", "station9.x"]\nmatrix = [[4e-6, 1e-7], [1e-7, 1e-6]]\n'
+    text = frames.read_text().replace("[stations.3]\n", errors)
+    frames.write_text(f"{text}\n{table}".replace("station9", "station2"))
+    layout = folder / "prism_layout.example.toml"
+    layout.write_text(layout.read_text().replace("[prisms.2]\n", "[prisms.2]\nsigma_m = [0.0, 0.0, 0.001]\n"))
+    known = _parameters(folder)
+    station = known.stations[2]
+    assert (station.vertical_index_rad, station.collimation_rad, station.atmospheric_ppm) == (
+        2e-4,
+        -1e-4,
+        4.0,
+    )
+    assert known.stations[1].atmospheric_ppm == 0.0
+    assert known.setup_covariance is not None
+    assert known.setup_covariance.components == (
+        "station3.z",
+        "station2.x",
+        "prism2.x",
+        "prism2.y",
+        "prism2.z",
+    )
+    assert known.setup_covariance.matrix[1] == (1e-7, 1e-6, 0.0, 0.0, 0.0)
+    assert known.setup_covariance.matrix[4][4] == 1e-6
+
+
+@pytest.mark.parametrize(
+    ("components", "matrix", "message"),
+    [
+        ('["station2.z"]', "[[-1.0]]", "no covariance"),
+        ('["station2.z"]', "[[1.0, 0.0]]", "not 1 x 1"),
+        ('["station7.z"]', "[[1.0]]", "station7.z is no quantity of this file"),
+        ('["prism1.z"]', "[[1.0]]", "prism1.z is no quantity of this file"),
+    ],
+)
+def test_wrong_covariance_is_rejected(folder: Path, components: str, matrix: str, message: str) -> None:
+    """The message names file and reason."""
+    frames = folder / "station_frames.example.toml"
+    table = f"[covariance]\ncomponents = {components}\nmatrix = {matrix}\n"
+    frames.write_text(f"{frames.read_text()}\n{table}")
+    with pytest.raises(ConfigError, match=f"station_frames.*{message}"):
+        _parameters(folder)
+
+
 def test_defaults_are_those_of_the_model() -> None:
     """An empty configuration has the defaults of the parameters."""
     assert pipeline_parameters(PipelineConfig()) == PipelineParameters()

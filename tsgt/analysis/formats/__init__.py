@@ -11,7 +11,7 @@ from tsgt.analysis.formats.odometry import read_stationary_intervals
 from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, tracked_prisms
 from tsgt.analysis.formats.rtklib import QUALITIES, SECOND_NS, PosFile, TimeSystem, read_pos
 from tsgt.analysis.formats.rts_files import PublishedTrack, read_prisms, read_tracks
-from tsgt.analysis.formats.setup_files import write_prism_layout, write_station_frames
+from tsgt.analysis.formats.setup_files import InstrumentErrors, write_prism_layout, write_station_frames
 from tsgt.analysis.formats.target_file import (
     PrismFile,
     TargetFile,
@@ -24,6 +24,7 @@ from tsgt.analysis.formats.target_file import (
 __all__ = [
     "QUALITIES",
     "SECOND_NS",
+    "InstrumentErrors",
     "PosFile",
     "PrismFile",
     "PublishedTrack",

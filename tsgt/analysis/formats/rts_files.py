@@ -91,7 +91,9 @@ def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPo
     in m in the robot frame, the rest is ignored; or from a ``.toml`` of kind ``prism_layout``. Raises InputFileError if a
     row or a number is missing, or the prisms coincide or lie in a line; ConfigError if the set-up file cannot be used.
     """
-    positions = load_prism_layout(path) if path.suffix == ".toml" else _read_sensor_positions(path)
+    positions = (
+        load_prism_layout(path).positions_m if path.suffix == ".toml" else _read_sensor_positions(path)
+    )
     missing = [prism for prism in numbers if prism not in positions]
     if missing:
         raise InputFileError(

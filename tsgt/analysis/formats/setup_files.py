@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import tomli_w
@@ -13,7 +14,25 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.geometry import FloatArray
-    from tsgt.model import TargetResidual
+    from tsgt.model import SetupCovariance, TargetResidual
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstrumentErrors:
+    """Estimated instrument errors of a station, with the signs of ``StationParameters``; None: not estimated."""
+
+    vertical_index_rad: float | None = None
+    collimation_rad: float | None = None
+    range_scale_ppm: float | None = None
+
+    def table(self) -> dict[str, float]:
+        """Return the keys of the set-up file."""
+        values = {
+            "vertical_index_mrad": None if self.vertical_index_rad is None else 1e3 * self.vertical_index_rad,
+            "collimation_mrad": None if self.collimation_rad is None else 1e3 * self.collimation_rad,
+            "range_scale_ppm": self.range_scale_ppm,
+        }
+        return {key: float(value) for key, value in values.items() if value is not None}
 
 
 def write_station_frames(
@@ -24,6 +43,8 @@ def write_station_frames(
     comment: str,
     latencies_ms: Mapping[int, float] | None = None,
     targets: Mapping[int, Sequence[TargetResidual]] | None = None,
+    instrument_errors: Mapping[int, InstrumentErrors] | None = None,
+    covariance: SetupCovariance | None = None,
 ) -> None:
     """Write a file of kind ``station_frames``, atomically.
 
@@ -34,6 +55,8 @@ def write_station_frames(
     comment : Origin of the frames, written as one comment line at the top.
     latencies_ms : From the measurement to its timestamp by station number, if calibrated.
     targets : Target residuals by station number, if the frames come from targets.
+    instrument_errors : By number of the stations for which they are estimated.
+    covariance : Joint covariance of all these, if known.
 
     Raises
     ------
@@ -46,25 +69,43 @@ def write_station_frames(
             table["rms_mm"] = _to_mm(rms_m[station])
         if latencies_ms is not None:
             table["latency_ms"] = round(float(latencies_ms[station]), 6)
+        if instrument_errors is not None and station in instrument_errors:
+            table |= instrument_errors[station].table()
         if targets is not None and targets.get(station):
             table["targets"] = [_target(target) for target in targets[station]]
         tables[str(station)] = table
-    _write(path, {"kind": "station_frames", "stations": tables}, comment)
+    _write(path, {"kind": "station_frames", "stations": tables} | _covariance(covariance), comment)
 
 
 def write_prism_layout(
-    path: Path, positions_m: Mapping[int, FloatArray], sigmas_m: Mapping[int, FloatArray], *, comment: str
+    path: Path,
+    positions_m: Mapping[int, FloatArray],
+    sigmas_m: Mapping[int, FloatArray],
+    *,
+    comment: str,
+    covariance: SetupCovariance | None = None,
 ) -> None:
     """Write a file of kind ``prism_layout``, atomically, with a comment line at the top that states the origin.
 
-    By prism number: (3,) position in the frame ``robot`` in m, and one sigma of each coordinate. Raises OutputFileError if
-    the file cannot be written.
+    By prism number: (3,) position in the frame ``robot`` in m, and one sigma of each coordinate; ``covariance``: of all
+    of them, if known. Raises OutputFileError if the file cannot be written.
     """
     tables = {
         str(prism): {"position_m": list(map(float, position)), "sigma_m": list(map(float, sigmas_m[prism]))}
         for prism, position in sorted(positions_m.items())
     }
-    _write(path, {"kind": "prism_layout", "prisms": tables}, comment)
+    _write(path, {"kind": "prism_layout", "prisms": tables} | _covariance(covariance), comment)
+
+
+def _covariance(covariance: SetupCovariance | None) -> dict[str, Any]:
+    if covariance is None:
+        return {}
+    return {
+        "covariance": {
+            "components": list(covariance.components),
+            "matrix": [list(row) for row in covariance.matrix],
+        }
+    }
 
 
 def _target(fit: TargetResidual) -> dict[str, Any]:

@@ -58,4 +58,4 @@ def usable_layout(prisms: Mapping[int, Vector3], source: Path | str) -> Mapping[
 
 def read_layout(path: Path) -> Mapping[int, Vector3]:
     """Read a prism layout (set-up file); raises as :func:`usable_layout`."""
-    return usable_layout(dict(sorted(load_prism_layout(path).items())), path)
+    return usable_layout(dict(sorted(load_prism_layout(path).positions_m.items())), path)

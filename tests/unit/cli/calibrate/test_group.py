@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_frames
+from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_calibration
 
 if TYPE_CHECKING:
     from harness.cli import Tsgt
@@ -156,7 +156,9 @@ def test_set_up_file_reproduces_the_frames_exactly(tsgt: Tsgt, tmp_path: Path) -
         "calibrate", "targets", documented(0, tmp_path), *TARGET_CONSTANT, "--json", "--output", output
     )
     assert done.code == 0
-    frames = load_station_frames(output)
+    frames = {
+        number: each.T_station1_station for number, each in load_station_calibration(output).stations.items()
+    }
     assert np.array(frames[2]).tolist() == done.json()["stations"]["2"]["T_station1_station"]
     np.testing.assert_array_equal(frames[1], np.eye(4))
     assert output.read_text(encoding="utf-8").startswith("# written by tsgt calibrate targets ")
@@ -193,7 +195,7 @@ def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:
     assert solved["distances_mm"] == pytest.approx({"1-2": 987.0, "1-3": 681.6, "2-3": 814.7}, abs=1.0)
     assert solved["rms_mm"] < 1
     assert solved["used"] == ["front_left", "front_right", "rear_left", "mast"]
-    layout = load_prism_layout(output)
+    layout = load_prism_layout(output).positions_m
     assert {str(prism): list(position) for prism, position in layout.items()} == solved["prisms"]
 
 

@@ -10,7 +10,7 @@ import pytest
 from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.analysis.calibration import calibrate_recording
-from tsgt.config import load_station_frames, load_station_latencies
+from tsgt.config import load_station_calibration
 from tsgt.geometry import exp_so3
 from tsgt.geometry.calibration import SetupPrior
 from tsgt.recording import load_recording
@@ -55,10 +55,12 @@ def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_
         assert abs(station["latency_ms"]) < 0.5
         assert len(station["sigma_mm"]) == len(station["sigma_mrad"]) == 3
     assert found["before"] is found["after"] is None
-    frames, latencies = load_station_frames(output), load_station_latencies(output)
-    assert sorted(frames) == sorted(latencies) == [1, 2, 3]
-    assert [list(row) for row in frames[2]] == found["stations"]["2"]["T_station1_station"]
-    assert latencies[3] == round(1e6 * found["stations"]["3"]["latency_ms"])
+    stations = load_station_calibration(output).stations
+    assert sorted(stations) == [1, 2, 3]
+    assert [list(row) for row in stations[2].T_station1_station] == found["stations"]["2"][
+        "T_station1_station"
+    ]
+    assert stations[3].latency_ns == round(1e6 * found["stations"]["3"]["latency_ms"])
 
 
 def test_result_is_independent_of_the_robot_origin(recording: Path) -> None:

@@ -1,0 +1,68 @@
+"""Replacing the set-up in the parameters of a recording by that of set-up files."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from tsgt.config import setup_covariance
+from tsgt.errors import ConfigError, DegenerateGeometryError
+from tsgt.geometry import check_layout
+from tsgt.model import PrismPosition
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.config import PrismLayout, StationCalibration
+    from tsgt.model import Parameters, SetupCovariance
+
+
+def with_calibration(parameters: Parameters, calibration: StationCalibration, *, path: Path) -> Parameters:
+    """Replace frames, instrument errors, latencies, target residuals and their covariance by those of a set-up file.
+
+    Raises ConfigError if a station is missing.
+    """
+    missing = [s.station for s in parameters.stations if s.station not in calibration.stations]
+    if missing:
+        raise ConfigError(
+            f"{path}: stations.{missing[0]}: missing; the recording has this station", path=path
+        )
+    stations = tuple(calibration.stations[s.station].applied(s) for s in parameters.stations)
+    return dataclasses.replace(
+        parameters,
+        stations=stations,
+        setup_covariance=_covariance(parameters, calibration.covariance, parameters.setup_covariance),
+    )
+
+
+def with_layout(parameters: Parameters, layout: PrismLayout, *, path: Path) -> Parameters:
+    """Replace the prism layout and its covariance by those of a set-up file; prisms that the recording lacks are ignored.
+
+    Raises ConfigError if a prism of the recording has no position in the file, or the layout determines no pose.
+    """
+    positions_m = layout.positions_m
+    missing = [p.prism for p in parameters.prisms if p.prism not in positions_m]
+    if missing:
+        raise ConfigError(f"{path}: prisms.{missing[0]}: missing; the recording has this prism", path=path)
+    numbers = [p.prism for p in parameters.prisms]
+    try:
+        check_layout([positions_m[number] for number in numbers], names=numbers)
+    except DegenerateGeometryError as error:
+        raise ConfigError(f"{path}: {error}", path=path, key="prisms") from error
+    prisms = tuple(PrismPosition(prism=number, position_m=positions_m[number]) for number in numbers)
+    return dataclasses.replace(
+        parameters,
+        prisms=prisms,
+        setup_covariance=_covariance(parameters, parameters.setup_covariance, layout.covariance),
+    )
+
+
+def _covariance(
+    parameters: Parameters, stations: SetupCovariance | None, prisms: SetupCovariance | None
+) -> SetupCovariance | None:
+    return setup_covariance(
+        stations,
+        prisms,
+        station_numbers=(s.station for s in parameters.stations),
+        prism_numbers=(p.prism for p in parameters.prisms),
+    )

@@ -6,6 +6,7 @@ bits for an item alone as in a batch: live stream, replay and post-processing ag
 """
 
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
+from tsgt.geometry.euler import euler_angles_rad, euler_covariance, euler_jacobian
 from tsgt.geometry.interpolation import (
     NO_GAP_NS,
     Interpolated,
@@ -60,6 +61,9 @@ __all__ = [
     "check_layout",
     "check_transform",
     "corrected_distance",
+    "euler_angles_rad",
+    "euler_covariance",
+    "euler_jacobian",
     "exp_so3",
     "interpolate",
     "interpolate_prisms",

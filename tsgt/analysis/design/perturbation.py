@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import check_layout, log_so3, pose_covariance, poses_from_prisms, rotate
+from tsgt.geometry import check_layout, euler_angles_rad, log_so3, pose_covariance, poses_from_prisms, rotate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -138,15 +138,6 @@ def first_order_sigmas(
     (covariance,) = pose_covariance(layout - point_m, np.eye(3)[None], covariances)
     sigmas = np.sqrt(np.diag(covariance))
     return sigmas[:3], sigmas[3:]
-
-
-def euler_angles_rad(R: FloatArray) -> FloatArray:
-    """Return roll, pitch and yaw of rotations, (..., 3): R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
-    # The arcsine of one element would be ill-conditioned near 90 degrees.
-    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
-    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    return np.stack([roll, pitch, yaw], axis=-1)
 
 
 def _distance_errors_m(layout: FloatArray, points: FloatArray) -> FloatArray:

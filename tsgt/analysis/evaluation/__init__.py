@@ -4,6 +4,20 @@ Comes in: poses, prism tracks, observations or a trajectory fit of a recording, 
 Goes out: error statistics. docs/reference/evaluate.md defines every figure.
 """
 
+from tsgt.analysis.evaluation.ate_rpe import (
+    ErrorSummary,
+    RelativeErrors,
+    TransformErrors,
+    absolute_errors,
+    relative_error_table,
+)
+from tsgt.analysis.evaluation.error_series import (
+    COMPONENTS,
+    PoseComponents,
+    component_sigmas,
+    error_components,
+    pose_components,
+)
 from tsgt.analysis.evaluation.held_out import (
     Fold,
     HeldOutErrors,
@@ -46,23 +60,31 @@ from tsgt.analysis.evaluation.residuals import (
 )
 
 __all__ = [
+    "COMPONENTS",
     "Align",
     "AlignedErrorStatistics",
     "EpochDistances",
+    "ErrorSummary",
     "Fold",
     "HeldOutErrors",
     "InterPrismDistances",
     "Outlier",
     "PairDistances",
+    "PoseComponents",
     "PoseErrorStatistics",
     "PoseErrors",
     "Reference",
+    "RelativeErrors",
     "ResidualStatistics",
     "StationaryStatistics",
+    "TransformErrors",
+    "absolute_errors",
     "compare",
     "compare_aligned",
+    "component_sigmas",
     "cross_validate",
     "distances_at_epochs",
+    "error_components",
     "folds",
     "held_out_errors",
     "inter_prism",
@@ -70,8 +92,10 @@ __all__ = [
     "interpolation_errors",
     "normalised_residuals",
     "outliers",
+    "pose_components",
     "pose_errors",
     "read_tum",
+    "relative_error_table",
     "residual_statistics",
     "stationary_errors",
     "training_rows",

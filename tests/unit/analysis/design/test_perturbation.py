@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 
 from tsgt.analysis.design import equivalent_noise, first_order_sigmas, perturbation_study
-from tsgt.analysis.design.perturbation import euler_angles_rad
 from tsgt.config import ScenarioConfig
 from tsgt.errors import DegenerateGeometryError
-from tsgt.geometry import exp_so3, rotation_from_quaternion
 
 LAYOUT = np.array([prism.position_m for prism in ScenarioConfig().prisms])
 """The prisms of the scenario ``dynamic``, at the paper's distances."""
@@ -115,16 +113,3 @@ def test_equivalent_noise_of_errors_larger_than_the_layout() -> None:
     """Five metres between prisms that are one metre apart."""
     found = equivalent_noise(LAYOUT, 5.0, samples=2000, point_m=CENTROID, random=_random())
     assert found.inter_prism_mean_m == pytest.approx(5.0, rel=1e-6)
-
-
-@pytest.mark.parametrize("angles_rad", [(0.1, -0.2, 0.3), (3.0, 1.5, -3.1), (-1.0, -1.57, 0.5)])
-def test_euler_angles_are_about_fixed_axes_x_y_z(angles_rad: tuple[float, float, float]) -> None:
-    """The inverse of R = Rz Ry Rx."""
-    x, y, z = (exp_so3(angle * axis) for angle, axis in zip(angles_rad, np.eye(3), strict=True))
-    np.testing.assert_allclose(euler_angles_rad(z @ y @ x), angles_rad, atol=1e-9)
-
-
-def test_euler_angles_of_many_rotations_at_once() -> None:
-    """Leading dimensions are kept."""
-    rotations = rotation_from_quaternion(_random().standard_normal((4, 5, 4)))
-    assert euler_angles_rad(rotations).shape == (4, 5, 3)

@@ -1,0 +1,74 @@
+"""Errors of poses against a reference over time, in six components with the stated sigmas of each. Sans-I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.analysis.evaluation.reference import match_poses
+from tsgt.geometry import euler_angles_rad, euler_covariance, rotation_from_quaternion
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.analysis.evaluation.reference import Reference
+    from tsgt.estimation import PoseBatch
+    from tsgt.geometry import FloatArray
+
+COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True, slots=True)
+class PoseComponents:
+    """Six components at N epochs: x, y, z of the poses' point in frame ``station1`` (m); roll, pitch, yaw (rad).
+
+    ``value``, (N, 6), are the poses or their errors; ``sigma``, (N, 6), what the poses state about them. NaN where unknown.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    value: FloatArray
+    sigma: FloatArray
+
+    @property
+    def within_two_sigma(self) -> FloatArray:
+        """Share of the known values within two sigmas of zero, (6,): 0.954 of normal errors. NaN without any."""
+        known = np.isfinite(self.value) & np.isfinite(self.sigma)
+        inside = known & (np.abs(self.value) <= 2 * self.sigma)
+        return np.where(known.any(axis=0), inside.sum(axis=0) / np.maximum(known.sum(axis=0), 1), np.nan)
+
+    @property
+    def rms(self) -> FloatArray:
+        """Root mean square of the known values, (6,); NaN without any."""
+        known = np.isfinite(self.value)
+        squares = np.where(known, self.value, 0.0) ** 2
+        return np.where(
+            known.any(axis=0), np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1)), np.nan
+        )
+
+
+def pose_components(poses: PoseBatch) -> PoseComponents:
+    """Return the components of all poses and their stated sigmas; NaN where a pose is not valid."""
+    valid = poses.valid[:, None]
+    R = rotation_from_quaternion(np.where(valid, poses.orientation_xyzw, [0.0, 0.0, 0.0, 1.0]))
+    value = np.concatenate([poses.position_m, euler_angles_rad(R)], axis=1)
+    sigma = component_sigmas(R, poses.covariance)
+    return PoseComponents(poses.stamp_ns, np.where(valid, value, np.nan), np.where(valid, sigma, np.nan))
+
+
+def error_components(poses: PoseBatch, reference: Reference) -> PoseComponents:
+    """Return the unaligned errors, estimated minus true, of the valid poses that have a reference, at the poses' own point."""
+    rows, true = match_poses(poses, reference)
+    R = rotation_from_quaternion(poses.orientation_xyzw[rows])
+    angles = euler_angles_rad(R) - euler_angles_rad(true[:, :3, :3])
+    turn = (angles + np.pi) % (2 * np.pi) - np.pi
+    value = np.concatenate([poses.position_m[rows] - true[:, :3, 3], turn], axis=1)
+    return PoseComponents(poses.stamp_ns[rows], value, component_sigmas(R, poses.covariance[rows]))
+
+
+def component_sigmas(R: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the sigmas of the six components, (N, 6), of poses with rotations R, (N, 3, 3), and covariances (N, 6, 6)."""
+    rotation = euler_covariance(R, covariance[:, 3:, 3:])
+    variances = [np.einsum("nii->ni", block) for block in (covariance[:, :3, :3], rotation)]
+    return np.asarray(np.sqrt(np.concatenate(variances, axis=1)))

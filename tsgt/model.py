@@ -7,6 +7,7 @@ fields under exactly these names; docs/explanation/conventions.md defines units,
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -35,6 +36,9 @@ MAX_INSTANT_NS = 2**63 - 1  # times are signed 64-bit integers, which end in 226
 MAX_NUMBER = 2**31 - 1  # of stations and prisms
 
 MAX_COORDINATE_M = 1e8  # map coordinates (UTM: 1e7) and geocentric coordinates are smaller
+
+_FRAME_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_./-]*")
+_OTHER_FRAME = re.compile(r"(station|prism)\d+")
 
 _ROTATION_TOLERANCE = 1e-3  # exceeds the rounding of a matrix that is written with four digits
 
@@ -433,8 +437,19 @@ class ReferencePoint(FiniteNumbers):
         _check_coordinates("position_m", self.position_m)
         if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < _ROTATION_TOLERANCE:
             raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
-        if not self.name or not self.name.isprintable():
-            raise ValueError(f"name holds {self.name!r}, expected a name")
+        if not _FRAME_NAME.fullmatch(self.name):
+            raise ValueError(
+                f"name holds {self.name!r}, expected a letter and then letters, digits, _ . / or -"
+            )
+        if _OTHER_FRAME.fullmatch(self.name):
+            raise ValueError(f"name holds {self.name!r}, which is another frame; choose another name")
+        identity = not any(self.position_m) and not any(self.orientation_xyzw[:3])
+        if self.name == ROBOT_FRAME and not identity:
+            raise ValueError(f"{ROBOT_FRAME} is the robot frame itself; give another point another name")
+
+
+ROBOT_ORIGIN = ReferencePoint()
+"""The robot frame itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -475,7 +490,7 @@ class Parameters:
     """One entry per prism."""
     pipeline: PipelineParameters = PipelineParameters()
     """Parameters of the estimators."""
-    reference_point: ReferencePoint = ReferencePoint()
+    reference_point: ReferencePoint = ROBOT_ORIGIN
     """The frame on the robot whose pose is exported."""
     setup_covariance: SetupCovariance | None = None
     """Uncertainty of station frames, latencies, instrument errors and prisms; null where unknown: taken as exact."""

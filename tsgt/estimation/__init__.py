@@ -2,7 +2,8 @@
 
 In: raw measurements and the parameters in force. Out: poses with covariance, validity and reason, as records or arrays.
 `linear` and `continuous` are the estimators, `live` puts measurements and poses in the order of the stream; `tracks` and
-`observations` apply latency, constants, frames and noise; `pose_batch` and `pose_output` hold and validate poses.
+`observations` apply latency, constants, frames and noise; `pose_batch` and `pose_output` hold and validate poses;
+`reference_point` carries them to another point of the robot.
 """
 
 from tsgt.estimation.linear import LinearEstimator
@@ -10,6 +11,16 @@ from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
+from tsgt.estimation.reference_point import (
+    centroid_at_point,
+    centroid_point,
+    parse_reference_point,
+    poses_at,
+    records_at,
+    reference_point_text,
+    transform_between,
+    transform_of,
+)
 from tsgt.estimation.tracks import (
     MAX_DISTANCE_M,
     Track,
@@ -31,8 +42,16 @@ __all__ = [
     "Track",
     "build_observations",
     "build_tracks",
+    "centroid_at_point",
+    "centroid_point",
     "has_plausible_time",
     "instrument_time_sigma_s",
     "measured_at_ns",
+    "parse_reference_point",
+    "poses_at",
+    "records_at",
+    "reference_point_text",
+    "transform_between",
+    "transform_of",
     "usable",
 ]

@@ -16,6 +16,7 @@ import numpy as np
 
 from tsgt.estimation.completeness import CompletenessTracker
 from tsgt.estimation.pose_batch import PoseBatch, Reason
+from tsgt.estimation.reference_point import poses_at
 from tsgt.estimation.tracks import Track, build_tracks, has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import (
     check_layout,
@@ -189,7 +190,7 @@ class LinearEstimator:
         usable_rows = np.flatnonzero(batch.valid)
         if len(usable_rows):
             self._fit(batch, usable_rows, samples, between)
-        return batch
+        return poses_at(batch, self._parameters.reference_point)
 
     def _describe(self, batch: PoseBatch, tracks: Sequence[Track], between: Interpolated) -> None:
         """Fill in each prism's reason, and station and age of its last measurement."""

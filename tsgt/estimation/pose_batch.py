@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
-from tsgt.model import ROBOT_FRAME, WORLD_FRAME
+from tsgt.model import ROBOT_ORIGIN, WORLD_FRAME, ReferencePoint
 from tsgt.recording import stream_records
 
 if TYPE_CHECKING:
@@ -60,18 +60,19 @@ class PoseBatch:
     stamp_ns: NDArray[np.int64]  # (N,) epochs on the master's Unix clock
     kind: NDArray[np.int8]  # (N,) values of :class:`Kind`
     reason: NDArray[np.int8]  # (N,) values of :class:`Reason`
-    position_m: NDArray[np.float64]  # (N, 3) origin of the robot frame in the frame ``station1``
-    orientation_xyzw: NDArray[np.float64]  # (N, 4) of the robot frame in the frame ``station1``
+    position_m: NDArray[np.float64]  # (N, 3) of the reference point in the frame ``station1``
+    orientation_xyzw: NDArray[np.float64]  # (N, 4) of its axes in the frame ``station1``
     covariance: NDArray[np.float64]
     """(N, 6, 6): x, y, z, rotations about the fixed axes x, y, z, in the frame ``station1``, in m and rad."""
-    velocity_mps: NDArray[np.float64]  # (N, 3) of the robot's origin, in ``station1``
-    angular_velocity_radps: NDArray[np.float64]  # (N, 3) in the robot frame
+    velocity_mps: NDArray[np.float64]  # (N, 3) of the reference point, in ``station1``
+    angular_velocity_radps: NDArray[np.float64]  # (N, 3) in the axes of the reference point
     residual_m: NDArray[np.float64]  # (N,) root mean square of the prisms' distances from the fitted layout
     station: NDArray[np.int64]  # (N, P) the station that last measured each prism
     age_s: NDArray[np.float64]  # (N, P) age of that measurement at the epoch; NaN where there was none
     prism_residual_m: NDArray[np.float64]  # (N, P) distance of each prism from the fitted layout
     prism_reason: NDArray[np.int8]  # (N, P) values of :class:`Reason` per prism
     prisms: tuple[int, ...]  # numbers of the prisms, the order of the columns
+    reference_point: ReferencePoint = ROBOT_ORIGIN  # the frame on the robot whose poses these are
 
     @classmethod
     def blank(
@@ -102,14 +103,19 @@ class PoseBatch:
         some = [batch for batch in batches if len(batch)]
         if len(some) <= 1:
             return (some or batches)[0]
-        arrays = {f.name: np.concatenate([getattr(b, f.name) for b in some]) for f in fields(cls)[:-1]}
-        return cls(**arrays, prisms=batches[0].prisms)
+        arrays: dict[str, Any] = {
+            name: np.concatenate([getattr(b, name) for b in some]) for name in cls._arrays()
+        }
+        return replace(some[0], **arrays)
 
     def select(self, rows: NDArray[np.bool_]) -> PoseBatch:
         """Return the poses of a mask."""
-        return PoseBatch(
-            **{f.name: getattr(self, f.name)[rows] for f in fields(self)[:-1]}, prisms=self.prisms
-        )
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._arrays()}
+        return replace(self, **arrays)
+
+    @classmethod
+    def _arrays(cls) -> list[str]:
+        return [f.name for f in fields(cls) if f.name not in ("prisms", "reference_point")]
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -152,7 +158,7 @@ class PoseBatch:
             yield stream_records.PoseRecord(
                 stamp_ns=stamp,
                 frame=WORLD_FRAME,
-                child_frame=ROBOT_FRAME,
+                child_frame=self.reference_point.name,
                 position_m=position,
                 orientation_xyzw=orientation,
                 covariance=covariance,

@@ -1,4 +1,4 @@
-"""Trajectory states to poses of the robot frame, with their validity. Sans-I/O."""
+"""Trajectory states to poses of the reference point, with their validity. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from tsgt.estimation.observations import centroid_m
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
+from tsgt.estimation.reference_point import poses_at
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.geometry.trajectory import ros_covariance, state_at_point, with_second_order_terms
 
@@ -75,6 +76,7 @@ class ContinuousPoseOutput:
             for prism in self._prisms
         ]
         self._to_origin_m = -centroid_m(parameters)
+        self._reference_point = parameters.reference_point
 
     def predicted(
         self,
@@ -106,7 +108,7 @@ class ContinuousPoseOutput:
         *,
         converged: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
-        """Return poses of the origin of the robot frame from measurements on both sides of their epochs.
+        """Return poses of the reference point from measurements on both sides of their epochs.
 
         A pose is valid while the sigmas of its position at the prisms' centroid and of its rotation, each in its least
         certain direction, are within the limits, and the prisms' residuals are. The reason of an uncertain pose is that
@@ -187,7 +189,7 @@ class ContinuousPoseOutput:
         missing = batch.prism_reason.max(axis=1)
         if states is None:
             batch.reason[:] = np.where(missing, missing, Reason.DEGENERATE_GEOMETRY)
-            return batch
+            return poses_at(batch, self._reference_point)
         limits, rotation = self._limits, states.rotation
         variance_m2 = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1]
         sigma_m = np.sqrt(np.where(variance_m2 >= 0, variance_m2, np.nan))
@@ -217,4 +219,4 @@ class ContinuousPoseOutput:
             batch.reason[~converged & (batch.reason == Reason.VALID)] = Reason.UNCERTAIN
         if uncertain.any():
             batch.reason[uncertain] = np.where(missing, missing, Reason.UNCERTAIN)[uncertain]
-        return batch
+        return poses_at(batch, self._reference_point)

@@ -1,6 +1,6 @@
 """Raw measurements to the observations of the estimator ``continuous``.
 
-Applies latency, prism constant, atmospheric scale and noise; the raw measurement stays unchanged. Prism positions are
+Applies latency, instrument errors, prism constant, atmospheric scale and noise; the raw measurement stays unchanged. Prism positions are
 relative to their centroid, whose motion the motion prior describes: the origin of a layout is arbitrary, and a tilting
 robot swings a distant origin about, which the prior would interpret as driving.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
-from tsgt.geometry import corrected_distance, polar_to_cartesian
+from tsgt.geometry import corrected_angles, corrected_distance, polar_to_cartesian
 from tsgt.geometry.trajectory import Observations
 from tsgt.model import PointMeasurement, PolarMeasurement
 
@@ -73,9 +73,13 @@ def build_observations(
                     ppm=station.atmospheric_ppm,
                 )
             )
-            points[i] = polar_to_cartesian(
-                measurement.horizontal_angle_rad, measurement.zenith_angle_rad, distance_m
+            angles_rad = corrected_angles(
+                measurement.horizontal_angle_rad,
+                measurement.zenith_angle_rad,
+                vertical_index_rad=station.vertical_index_rad,
+                collimation_rad=station.collimation_rad,
             )
+            points[i] = polar_to_cartesian(*angles_rad, distance_m)
             sigmas[i] = _sigmas_m(station.noise, distance_m)
         else:
             points[i] = measurement.position_m

@@ -64,6 +64,8 @@ class PoseBatch:
     orientation_xyzw: NDArray[np.float64]  # (N, 4) of its axes in the frame ``station1``
     covariance: NDArray[np.float64]
     """(N, 6, 6): x, y, z, rotations about the fixed axes x, y, z, in the frame ``station1``, in m and rad."""
+    covariance_common: NDArray[np.float64]
+    """(N, 6, 6) part of it that all poses share, from the uncertainty of the set-up; NaN where that is unknown."""
     velocity_mps: NDArray[np.float64]  # (N, 3) of the reference point, in ``station1``
     angular_velocity_radps: NDArray[np.float64]  # (N, 3) in the axes of the reference point
     residual_m: NDArray[np.float64]  # (N,) root mean square of the prisms' distances from the fitted layout
@@ -87,6 +89,7 @@ class PoseBatch:
             position_m=np.full((n, 3), np.nan),
             orientation_xyzw=np.full((n, 4), np.nan),
             covariance=np.full((n, 6, 6), np.nan),
+            covariance_common=np.full((n, 6, 6), np.nan),
             velocity_mps=np.full((n, 3), np.nan),
             angular_velocity_radps=np.full((n, 3), np.nan),
             residual_m=np.full(n, np.nan),
@@ -145,6 +148,7 @@ class PoseBatch:
             self.position_m.tolist(),
             self.orientation_xyzw.tolist(),
             self.covariance.reshape(-1, 36).tolist(),
+            self.covariance_common.reshape(-1, 36).tolist(),
             self.velocity_mps.tolist(),
             self.angular_velocity_radps.tolist(),
             self.residual_m.tolist(),
@@ -152,9 +156,11 @@ class PoseBatch:
             strict=True,
         )
         for stamp, kind, reason, known, *arrays, residual, shares in rows:
-            position, orientation, covariance, velocity, angular_velocity = (
+            position, orientation, covariance, common, velocity, angular_velocity = (
                 tuple(array) if known else None for array in arrays
             )
+            if common is not None and math.isnan(common[0]):
+                common = None  # the set-up's uncertainty is unknown
             yield stream_records.PoseRecord(
                 stamp_ns=stamp,
                 frame=WORLD_FRAME,
@@ -162,6 +168,7 @@ class PoseBatch:
                 position_m=position,
                 orientation_xyzw=orientation,
                 covariance=covariance,
+                covariance_common=common,
                 velocity_mps=velocity,
                 angular_velocity_radps=angular_velocity,
                 estimator=Kind(kind).estimator,

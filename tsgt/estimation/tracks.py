@@ -1,6 +1,6 @@
 """Raw measurements to each prism's track in the frame ``station1``.
 
-Applies latency, prism constant, atmospheric scale and the station's frame; the raw measurement stays unchanged.
+Applies latency, instrument errors, prism constant, atmospheric scale and the station's frame; the raw measurement stays unchanged.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry import (
+    corrected_angles,
     corrected_distance,
     measurement_covariance,
     polar_to_cartesian,
@@ -142,8 +143,12 @@ def _track_of(station: StationParameters, measurements: Sequence[Measurement]) -
 def _from_polar(
     station: StationParameters, measurements: Sequence[PolarMeasurement]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    horizontal = np.array([m.horizontal_angle_rad for m in measurements])
-    zenith = np.array([m.zenith_angle_rad for m in measurements])
+    horizontal, zenith = corrected_angles(
+        [m.horizontal_angle_rad for m in measurements],
+        [m.zenith_angle_rad for m in measurements],
+        vertical_index_rad=station.vertical_index_rad,
+        collimation_rad=station.collimation_rad,
+    )
     slope = np.array([m.slope_distance_m for m in measurements], dtype=np.float64)
     distance = corrected_distance(slope, constant_m=station.prism_constant_m, ppm=station.atmospheric_ppm)
     frame = np.array(station.T_station1_station)

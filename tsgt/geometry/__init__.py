@@ -18,6 +18,7 @@ from tsgt.geometry.interpolation import (
 from tsgt.geometry.polar import (
     cartesian_jacobian,
     cartesian_to_polar,
+    corrected_angles,
     corrected_distance,
     measurement_covariance,
     polar_jacobian,
@@ -60,6 +61,7 @@ __all__ = [
     "cartesian_to_polar",
     "check_layout",
     "check_transform",
+    "corrected_angles",
     "corrected_distance",
     "euler_angles_rad",
     "euler_covariance",

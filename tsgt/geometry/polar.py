@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from tsgt.model import InstrumentNoise
 
 
+MIN_SINE = 0.01
+"""Sine of the zenith angle below which a collimation error is not corrected: nearly on the vertical axis its effect on the
+horizontal angle is no longer linear."""
+
+
 def polar_to_cartesian(
     horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
 ) -> FloatArray:
@@ -48,6 +53,28 @@ def cartesian_to_polar(points: ArrayLike) -> tuple[FloatArray, FloatArray, Float
 def corrected_distance(slope_distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
     """Corrected slope distance in m: atmospheric ppm of the raw distance, and the prism constant, which is not scaled."""
     return np.asarray(slope_distance_m, dtype=np.float64) * (1 + ppm * 1e-6) + constant_m
+
+
+def corrected_angles(
+    horizontal_angle_rad: ArrayLike,
+    zenith_angle_rad: ArrayLike,
+    *,
+    vertical_index_rad: float,
+    collimation_rad: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Horizontal and zenith angles in rad without the instrument's vertical index and collimation errors.
+
+    The zenith angle reads ``z + index`` in the first face and ``2 pi - z + index`` in the second. The line of sight deviates
+    clockwise by the collimation error, and the horizontal angle reads that over sin(zenith angle) too small; the sine, and so
+    the correction, changes its sign with the face. Straight up or down, where it diverges, it is left out.
+    """
+    zenith = np.asarray(zenith_angle_rad, dtype=np.float64)
+    sine = np.sin(zenith)
+    steep = np.abs(sine) < MIN_SINE
+    horizontal = np.asarray(horizontal_angle_rad, dtype=np.float64) + np.where(
+        steep, 0.0, collimation_rad / np.where(steep, 1.0, sine)
+    )
+    return horizontal, zenith - vertical_index_rad
 
 
 def raw_distance(distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from harness.scene import START, Motion, stationary_scene
 
-from tsgt.estimation import build_observations
+from tsgt.estimation import build_observations, build_tracks
 from tsgt.estimation.observations import INSTRUMENT_TIME_SIGMA_S, MIN_SIGMA_M, centroid_m
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.trajectory import fit_trajectory
@@ -81,3 +81,24 @@ def test_initial_time_error_gives_consistent_poses() -> None:
     errors = np.concatenate([middle - states.position, turned], axis=1)
     nees = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance[:, :6, :6], errors[..., None])[..., 0])
     assert nees.max() < 20.0
+
+
+def test_instrument_errors_are_corrected_in_both_estimators() -> None:
+    """Angles that read an index and a collimation error give the same points as angles without."""
+    exact = SCENE.measure(2, 1.0)
+    index, collimation = 3e-4, -2e-4
+    stations = tuple(
+        replace(station, vertical_index_rad=index, collimation_rad=collimation)
+        for station in SCENE.parameters.stations
+    )
+    parameters = replace(SCENE.parameters, stations=stations)
+    read = replace(
+        exact,
+        zenith_angle_rad=exact.zenith_angle_rad + index,
+        horizontal_angle_rad=exact.horizontal_angle_rad - collimation / np.sin(exact.zenith_angle_rad),
+    )
+    expected, _ = build_observations(SCENE.parameters, [exact], origin_ns=START)
+    found, _ = build_observations(parameters, [read], origin_ns=START)
+    assert found.points_m == pytest.approx(expected.points_m, abs=1e-5)
+    tracks = [build_tracks(*each)[2] for each in ((SCENE.parameters, [exact]), (parameters, [read]))]
+    assert tracks[1].points_m == pytest.approx(tracks[0].points_m, abs=1e-5)

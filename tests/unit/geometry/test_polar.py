@@ -9,6 +9,7 @@ from tsgt.errors import GeometryError
 from tsgt.geometry import (
     cartesian_jacobian,
     cartesian_to_polar,
+    corrected_angles,
     corrected_distance,
     measurement_covariance,
     polar_jacobian,
@@ -130,3 +131,21 @@ def test_noise_model_broadcasts_to_one_matrix_per_measurement() -> None:
     h, z, d = np.array([[0.1, 2.0], [1.4, 1.6], [5.0, 70.0]])
     together = measurement_covariance(h, z, d, TRACKING_NOISE)
     np.testing.assert_array_equal(together[1], measurement_covariance(2.0, 1.6, 70.0, TRACKING_NOISE))
+
+
+@pytest.mark.parametrize("second_face", [False, True])
+def test_angle_errors_of_the_instrument_are_corrected(second_face: bool) -> None:  # noqa: FBT001
+    """Readings with index and collimation errors give the target; the mean of both faces needs no correction."""
+    h, z, index, collimation = 0.7, 1.2, 3e-4, 2e-4
+    # The telescope's line of sight is off by the collimation error to the right of it, whichever face.
+    read_h, read_z = h - collimation / np.sin(z), z + index
+    if second_face:
+        read_h, read_z = h + np.pi + collimation / np.sin(z), 2 * np.pi - z + index
+    found = corrected_angles(read_h, read_z, vertical_index_rad=index, collimation_rad=collimation)
+    assert polar_to_cartesian(*found, 100.0) == pytest.approx(polar_to_cartesian(h, z, 100.0), abs=1e-5)
+
+
+def test_collimation_is_not_corrected_straight_up() -> None:
+    """Its effect on the horizontal angle diverges there."""
+    horizontal, zenith = corrected_angles(0.3, 0.0, vertical_index_rad=0.0, collimation_rad=1e-3)
+    assert (float(horizontal), float(zenith)) == (0.3, 0.0)

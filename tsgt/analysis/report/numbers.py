@@ -31,7 +31,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
     poses = f.poses
     bound_ms, fast_mps = bound_and_speed(f)
     found: dict[str, Any] = {
-        "verdicts": [{"level": v.level.value, "text": v.text} for v in verdicts(f)],
+        "verdicts": [{"level": v.level.value, "text": v.text, "repair": v.repair} for v in verdicts(f)],
         "estimator": None if poses is None else Kind(poses.kind[0]).estimator,
         "start_ns": f.start_ns,
         "measured_s": f.duration_s,

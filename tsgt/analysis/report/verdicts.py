@@ -42,10 +42,11 @@ class Level(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A statement about a result, with advice."""
+    """A statement about a result, and what to do about it: an imperative sentence, commands in backquotes; empty if nothing."""
 
     level: Level
     text: str
+    repair: str = ""
 
 
 def verdicts(findings: Findings) -> list[Verdict]:
@@ -78,7 +79,8 @@ def _poses(f: Findings) -> Iterator[Verdict]:
         level,
         # Rounded down, so that 100.0 % means all poses.
         f"{math.floor(1e3 * share) / 10:.1f}% of the poses of {estimator} are valid"
-        f"{f' (not valid: {why})' if why else ''}. Use valid poses only.",
+        f"{f' (not valid: {why})' if why else ''}.",
+        "" if share == 1.0 else "Use valid poses only.",
     )
     sigma_mm = position_sigma_mm(poses)
     yield Verdict(
@@ -91,18 +93,25 @@ def _poses(f: Findings) -> Iterator[Verdict]:
 
 def _stations(f: Findings) -> Iterator[Verdict]:
     limit_s = f.recording.parameters.pipeline.outage_limit_ns / 1e9
+    gaps = []
     for number, each in f.station_statistics.items():
         if not each.usable:
             yield Verdict(Level.BAD, f"Station {number} has no usable measurement.")
         elif each.in_gaps > _IN_GAPS:
-            yield Verdict(
-                Level.CARE,
-                f"Station {number} has {each.gaps} gap{'s' * (each.gaps > 1)} longer than {limit_s:g} s, {each.in_gaps:.0%} of "
-                f"the time; the longest lasts {each.longest_gap_s:.1f} s.",
-            )
+            gaps.append(f"station {number} {each.in_gaps:.0%} (the longest {each.longest_gap_s:.1f} s)")
+    if gaps:
+        yield Verdict(
+            Level.CARE,
+            f"Measurements are missing for more than {limit_s:g} s in this share of the time: {', '.join(gaps)}.",
+            "See the figures of the stations for lost targets and lost radio packets."
+            if f.log.protocol is None
+            else "Add the measurements that the stations stored: `tsgt merge`.",
+        )
     if f.log.authenticated is False:
         yield Verdict(
-            Level.CARE, "The radio was not authenticated: data of other senders cannot be excluded."
+            Level.CARE,
+            "The radio was not authenticated: data of other senders cannot be excluded.",
+            "Make a key for the next drive: `tsgt radio key`.",
         )
 
 
@@ -123,7 +132,7 @@ def _times(f: Findings) -> Iterator[Verdict]:
     if math.isnan(bound_ms):
         yield Verdict(
             Level.CARE,
-            "No timestamp bound was recorded; the accuracy of the clock synchronisation is unknown.",
+            "The accuracy of the clock synchronisation is unknown: no timestamp bound was recorded.",
         )
     elif not math.isnan(fast_mps):
         bound_mm = bound_ms * fast_mps
@@ -152,6 +161,7 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         yield Verdict(
             Level.CARE,
             f"{why}: errors of layout, frames and prism constants cannot be separated from timing errors.",
+            "Stop for some seconds now and then.",
         )
     for pair in f.inter_prism.static:
         figures = pair.statistics()
@@ -159,13 +169,14 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         if abs(bias_mm) > _STATIC_BIAS_MM:
             yield Verdict(
                 Level.CARE,
-                f"Stationary, the mean distance {pair.name} deviates by {bias_mm:+.1f} mm from the layout: check the prism "
-                "layout, the prism constants and the station frames.",
+                f"While the robot stood still, the mean distance between the prisms {pair.name} deviates by {bias_mm:+.1f} mm from "
+                "the prism layout.",
+                "Check the prism layout, the prism constants and the station frames: `tsgt calibrate motion`.",
             )
     moving_mm = float(np.mean([figures.mean_abs_error for figures in moving]))
     yield Verdict(
         Level.GOOD if moving_mm <= _MOVING_MM else Level.CARE,
-        f"The mean inter-prism error over the whole recording is {moving_mm:.1f} mm.",
+        f"The measured distances between the prisms differ from the prism layout by {moving_mm:.1f} mm on average.",
     )
     if static:
         static_std_mm = float(np.mean([figures.std for figures in static]))
@@ -173,9 +184,10 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         if std_mm > _TIMING_SHARE * static_std_mm:
             yield Verdict(
                 Level.CARE,
-                f"The standard deviation of the inter-prism distances is {std_mm:.1f} mm over the whole recording, but "
-                f"{static_std_mm:.1f} mm stationary: the difference is due to linear interpolation between measurements, "
-                "timestamps and latencies (`tsgt calibrate motion`).",
+                f"The standard deviation of the distances between the prisms is {std_mm:.1f} mm over the whole recording, but "
+                f"{static_std_mm:.1f} mm while the robot stood still: the difference is due to linear interpolation between "
+                "measurements, timestamps and latencies.",
+                "Calibrate the latencies: `tsgt calibrate motion`.",
             )
 
 
@@ -187,6 +199,7 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
         yield Verdict(
             Level.CARE,
             "There are too few measurements to estimate motion prior and noise scale: both are those of the recording.",
+            "Record longer than some seconds.",
         )
     elif not _NOISE_SCALE[0] <= scale <= _NOISE_SCALE[1]:
         yield Verdict(
@@ -210,7 +223,9 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
     n = len(f.continuous.sources)
     if len(f.outliers) > _OUTLIERS * n:
         yield Verdict(
-            Level.CARE, f"{len(f.outliers)} of {n} measurements were rejected as outliers; see the residuals."
+            Level.CARE,
+            f"{len(f.outliers)} of {n} measurements were rejected as outliers.",
+            "See the list of outliers: reflections, a prism of another station, a lock that drifts.",
         )
 
 
@@ -220,6 +235,7 @@ def _reference(f: Findings) -> Iterator[Verdict]:
             yield Verdict(
                 Level.BAD,
                 f"No valid pose of {name} is within the time of the reference; nothing was compared.",
+                "Check that the reference is of this drive and on the same clock.",
             )
             continue
         consistent = math.isfinite(each.nees.mean) and _NEES[0] <= each.nees.mean <= _NEES[1]

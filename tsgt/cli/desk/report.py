@@ -74,7 +74,7 @@ def assess(
 def print_verdicts(found: Sequence[Verdict]) -> None:
     """Print verdicts, the worst first."""
     for verdict in found:
-        click.echo(f"{verdict.level.value}: {verdict.text}")
+        click.echo(f"{verdict.level.value}: {f'{verdict.text} {verdict.repair}'.rstrip()}")
 
 
 def report_evaluation(

@@ -86,7 +86,7 @@ def evaluate(name: str, recording: Recording, world: World, start_ns: int, end_n
         ("as configured", configured, None),
     ):
         found = fit_trajectory(
-            observations, prior=prior, occluded_prior=occluded_prior, noise_scale=motion.noise_scale
+            observations, prior=prior, occluded_prior=occluded_prior, noise_scale=motion.noise_scales
         )
         states, covariance = found.trajectory.at(at_s, dim=6)
         off_m = place_m - states.position

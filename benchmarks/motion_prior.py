@@ -44,13 +44,14 @@ CORRELATION_TIMES_S: dict[str, float | None] = {
 FREE_TIME_S = (0.03, 10.0)
 SIGMAS = (1e-3, 1e3)
 SCALES = (0.5, 20.0)
+DEVIATIONS = (0.1, 10.0)
 _TIMES = (2, 5)
 
 
 def tuned(observations: Observations, time_s: float | None) -> Hyperparameters:
     """Tune sigmas and noise scale with a given correlation time, or with the best."""
-    start = log_parameters(MotionPrior(), 1.0)
-    limits = [SIGMAS] * 6 + [SCALES]
+    start = log_parameters(MotionPrior(), np.ones((len(observations.frames), 3)))
+    limits = [SIGMAS] * 6 + [SCALES] + [DEVIATIONS] * (len(start) - 7)
     for row in _TIMES:
         limits[row] = FREE_TIME_S if time_s is None else (time_s, time_s)
         if time_s is not None:
@@ -72,7 +73,7 @@ def missed_m(observations: Observations, time_s: float | None) -> FloatArray:
     def by_fold(fold: Fold) -> FloatArray:
         own = seen[fold.number]
         kept = fit_trajectory(
-            observations.select(fold.training), prior=own.prior, noise_scale=own.noise_scale
+            observations.select(fold.training), prior=own.prior, noise_scale=own.noise_scales
         )
         return trajectory_errors(kept.trajectory, observations.select(fold.test))
 

@@ -304,8 +304,8 @@ class StationParameters(FiniteNumbers):
     noise: InstrumentNoise = TRACKING_NOISE
     """Noise of one measurement."""
     noise_scale: Vector3 = (1.0, 1.0, 1.0)
-    """Factors on that noise along the line of sight, horizontally and vertically across it, where estimated. For
-    ``continuous``."""
+    """Factors on that noise along the line of sight, horizontally and vertically across it, where estimated; multiplied
+    with ``noise_scale`` of the pipeline. For ``continuous``."""
     targets: tuple[TargetResidual, ...] = ()
     """Targets from which the frame was solved, with their residuals; empty where unknown, and for station 1."""
 

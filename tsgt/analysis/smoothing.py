@@ -20,15 +20,17 @@ from tsgt.estimation import (
     PoseBatch,
     build_observations,
     measured_at_ns,
+    noise_scales,
     usable,
 )
 from tsgt.geometry import check_layout
-from tsgt.geometry.trajectory import NOISE_FLOOR_SHARE, fit_trajectory, tune, with_noise_floor
+from tsgt.geometry.trajectory import NOISE_FLOOR_SHARE, fit_trajectory, overall_scale, tune, with_noise_floor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import Observations, TrajectoryFit
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
@@ -41,10 +43,11 @@ _POSE_DIM = 6
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """Process noise, and factor on the stated sigmas: ``tuned`` to the measurements; if too few, those of the recording."""
+    """Process noise and factors on the stated sigmas: ``tuned`` to the measurements; if too few, those of the recording."""
 
     prior: MotionPrior
-    noise_scale: float
+    noise_scales: FloatArray  # (S + 1, 3) by station, Cartesian points last, and component
+    noise_scale: float  # Their root mean square over all measurements and components
     tuned: bool
 
 
@@ -79,13 +82,13 @@ def smooth_recording(
     check_time_span(parameters, measurements, path)
     origin_ns = min(m.stamp_ns for m in measurements)
     observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
-    motion = estimate_motion_model(observations, parameters.pipeline)
+    motion = estimate_motion_model(observations, parameters.pipeline, recorded=noise_scales(parameters))
     try:
         found = fit_trajectory(
             observations,
             prior=motion.prior,
             occluded_prior=parameters.pipeline.motion,
-            noise_scale=motion.noise_scale,
+            noise_scale=motion.noise_scales,
             on_progress=on_progress,
         )
     except GeometryError as error:
@@ -96,14 +99,25 @@ def smooth_recording(
     return SmoothedRecording(poses, found, motion, sources, origin_ns)
 
 
-def estimate_motion_model(observations: Observations, pipeline: PipelineParameters) -> MotionModel:
-    """Estimate the hyperparameters, with a floor on the process noise; too few measurements: return those of ``pipeline``."""
+def estimate_motion_model(
+    observations: Observations, pipeline: PipelineParameters, *, recorded: FloatArray | None = None
+) -> MotionModel:
+    """Estimate the hyperparameters, with a floor on the process noise; too few measurements: return those of ``pipeline``.
+
+    ``recorded``: noise scales, (S + 1, 3), for that case; by default the factor of ``pipeline`` for all.
+    """
     try:
         tuned = tune(observations)
     except GeometryError:
-        return MotionModel(pipeline.motion, pipeline.noise_scale, tuned=False)
+        scales = (
+            np.full((len(observations.frames), 3), pipeline.noise_scale) if recorded is None else recorded
+        )
+        return MotionModel(pipeline.motion, scales, overall_scale(observations, scales), tuned=False)
     return MotionModel(
-        with_noise_floor(tuned.prior, pipeline.motion, NOISE_FLOOR_SHARE), tuned.noise_scale, tuned=True
+        with_noise_floor(tuned.prior, pipeline.motion, NOISE_FLOOR_SHARE),
+        tuned.noise_scales,
+        tuned.noise_scale,
+        tuned=True,
     )
 
 

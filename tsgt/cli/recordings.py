@@ -10,6 +10,7 @@ import click
 import numpy as np
 
 import tsgt
+from tsgt.analysis.evaluation import noise_scales_by_axis
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.setup_replacement import with_calibration, with_layout
 from tsgt.cli.options import path_type
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.smoothing import MotionModel
+    from tsgt.analysis.smoothing import MotionModel, SmoothedRecording
     from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters
     from tsgt.recording import Recording
@@ -105,11 +106,13 @@ def duration_s(poses: PoseBatch) -> float:
     return int(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9
 
 
-def motion_keys(motion: MotionModel) -> dict[str, Any]:
-    """Return motion prior and noise scale for ``--json``."""
+def motion_keys(found: SmoothedRecording) -> dict[str, Any]:
+    """Return motion prior and noise scales for ``--json``."""
+    motion = found.motion
     return {
         "motion": dataclasses.asdict(motion.prior),
         "noise_scale": motion.noise_scale,
+        "noise_scales": noise_scales_by_axis(found.fit, found.sources),
         "motion_tuned": motion.tuned,
     }
 

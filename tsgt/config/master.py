@@ -12,6 +12,7 @@ from tsgt.config.pipeline import PipelineConfig
 from tsgt.config.radio import MasterProtocolConfig, RadioConfig, check_numbers
 from tsgt.polygon import check_simple
 
+NoiseFactor = Annotated[float, Field(ge=0.001, le=1000)]
 Corner = tuple[Annotated[float, Field(ge=-1e6, le=1e6)], Annotated[float, Field(ge=-1e6, le=1e6)]]
 
 
@@ -37,6 +38,8 @@ class StationConfig(Model):
     """Latency from the measurement to its timestamp, subtracted from it. Positive: the timestamp is late."""
     noise: NoiseConfig = NoiseConfig()
     """Noise of one measurement."""
+    noise_scale: tuple[NoiseFactor, NoiseFactor, NoiseFactor] = (1.0, 1.0, 1.0)
+    """Factors on that noise along the line of sight, horizontally and vertically across it; for `continuous`."""
 
 
 class StreamConfig(Model):

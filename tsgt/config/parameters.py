@@ -66,6 +66,7 @@ def parameters(config: MasterConfig) -> Parameters:
                     atmospheric_ppm=station.atmospheric_ppm,
                     latency_ns=round(station.latency_ms * 1e6),
                     noise=noise(station.noise),
+                    noise_scale=station.noise_scale,
                 )
             )
             for station in config.stations

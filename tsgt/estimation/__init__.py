@@ -8,6 +8,7 @@ In: raw measurements and the parameters in force. Out: poses with covariance, va
 
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
+from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
 from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
@@ -47,6 +48,7 @@ __all__ = [
     "has_plausible_time",
     "instrument_time_sigma_s",
     "measured_at_ns",
+    "noise_scales",
     "parse_reference_point",
     "poses_at",
     "records_at",
@@ -54,4 +56,5 @@ __all__ = [
     "transform_between",
     "transform_of",
     "usable",
+    "with_noise_scales",
 ]

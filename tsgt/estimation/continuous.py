@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations
 from tsgt.estimation.pose_batch import Kind, PoseBatch
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
-from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
+from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states, scale_noise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,6 +49,7 @@ class ContinuousEstimator:
         self._columns = {prism.prism: column for column, prism in enumerate(parameters.prisms)}
         check_layout([prism.position_m for prism in parameters.prisms], names=tuple(self._columns))
         self._stations = {station.station: station for station in parameters.stations}
+        self._noise_scales = noise_scales(parameters)
         self._poses = ContinuousPoseOutput(parameters)
         self._window = FixedLagSmoother(self._limits.motion)
         self._pending: list[Measurement] = []
@@ -119,7 +121,7 @@ class ContinuousEstimator:
             return
         if not taken.all():
             observations = observations.select(taken)
-        self._window.update(replace(observations, sigmas_m=observations.sigmas_m * self._limits.noise_scale))
+        self._window.update(scale_noise(observations, self._noise_scales))
         self._record(times_ns[taken], stations[taken], observations.prism)
 
     def _record(

@@ -93,14 +93,14 @@ def calibrate_recording(
             tuned = {number: tune(some) for number, some in training.items()}
             recorded = Setup.of(observations)
             before = _cross_validated(
-                observations, splits, {n: (recorded, t.prior, t.noise_scale) for n, t in tuned.items()}
+                observations, splits, {n: (recorded, t.prior, t.noise_scales) for n, t in tuned.items()}
             )
         report("held-out prediction after")
         comparison = HeldOutComparison(
             cross_validate(splits, lambda fold: interpolation_errors(observations, fold)),
             before,
             _cross_validated(
-                observations, splits, {n: (c.setup, c.prior, c.noise_scale) for n, c in setups.items()}
+                observations, splits, {n: (c.setup, c.prior, c.noise_scales) for n, c in setups.items()}
             ),
         )
     return CalibratedRecording(whole, _with_setup(recording.parameters, whole), comparison)
@@ -109,12 +109,12 @@ def calibrate_recording(
 def _cross_validated(
     observations: Observations,
     splits: list[Fold],
-    models: dict[int, tuple[Setup, MotionPrior, float]],
+    models: dict[int, tuple[Setup, MotionPrior, FloatArray]],
 ) -> HeldOutErrors:
     def error_m(fold: Fold) -> FloatArray:
-        setup, prior, noise_scale = models[fold.number]
+        setup, prior, noise_scales = models[fold.number]
         training = setup.applied(observations.select(fold.training))
-        trajectory = fit_trajectory(training, prior=prior, noise_scale=noise_scale).trajectory
+        trajectory = fit_trajectory(training, prior=prior, noise_scale=noise_scales).trajectory
         return trajectory_errors(trajectory, setup.applied(observations.select(fold.test)))
 
     return cross_validate(splits, error_m)

@@ -54,6 +54,7 @@ from tsgt.analysis.evaluation.reference import (
 from tsgt.analysis.evaluation.residuals import (
     Outlier,
     ResidualStatistics,
+    noise_scales_by_axis,
     normalised_residuals,
     outliers,
     residual_statistics,
@@ -90,6 +91,7 @@ __all__ = [
     "inter_prism",
     "interior_mask",
     "interpolation_errors",
+    "noise_scales_by_axis",
     "normalised_residuals",
     "outliers",
     "pose_components",

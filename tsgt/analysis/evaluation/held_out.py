@@ -179,7 +179,7 @@ def held_out_errors(
             observations.select(fold.training),
             prior=motion.prior,
             occluded_prior=pipeline.motion,
-            noise_scale=motion.noise_scale,
+            noise_scale=motion.noise_scales,
         )
         return trajectory_errors(found.trajectory, observations.select(fold.test))
 

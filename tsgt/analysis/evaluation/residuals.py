@@ -96,6 +96,19 @@ def residual_statistics(
     return statistics
 
 
+def noise_scales_by_axis(fit: TrajectoryFit, sources: Sequence[Measurement]) -> dict[int, dict[str, float]]:
+    """Factors on the stated noise by station and measured axis, with the keys of :func:`residual_statistics`."""
+    station = np.array([source.station for source in sources])
+    factors: dict[int, dict[str, float]] = {}
+    for number in np.unique(station).tolist():
+        of_station = fit.observations.select(station == number)
+        factors[number] = {}
+        for polar, names in ((True, POLAR_AXES), (False, POINT_AXES)):
+            for row in np.unique(of_station.station[of_station.polar == polar]):
+                factors[number] |= zip(names, fit.noise_scales[row].tolist(), strict=True)
+    return factors
+
+
 def outliers(fit: TrajectoryFit, sources: Sequence[Measurement]) -> list[Outlier]:
     """Return the measurements that the fit rejected, the worst first."""
     rows = np.flatnonzero(fit.weights < 1.0)

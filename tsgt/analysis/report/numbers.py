@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tsgt.analysis.evaluation import noise_scales_by_axis
 from tsgt.analysis.report.calibration import calibration_numbers
 from tsgt.analysis.report.findings import position_sigma_mm
 from tsgt.analysis.report.motion import binned, gridded
@@ -65,6 +66,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
         found |= {
             "motion": dataclasses.asdict(motion.prior),
             "noise_scale": motion.noise_scale,
+            "noise_scales": noise_scales_by_axis(f.continuous.fit, f.continuous.sources),
             "motion_tuned": motion.tuned,
             "residuals": {
                 station: {axis: dataclasses.asdict(each) for axis, each in axes.items()}

@@ -150,7 +150,7 @@ def evaluate(
                 "still_s": found.stationary_s,
                 "inter_prism_static_mm": _figures(found.static),
                 **({} if predicted is None else {"held_out_mm": _held_out_keys(predicted)}),
-                **motion_keys(continuous.motion),
+                **motion_keys(continuous),
                 "residuals": {
                     station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
                     for station, axes in residuals.items()

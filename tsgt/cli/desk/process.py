@@ -34,12 +34,13 @@ from tsgt.cli.recordings import (
     write_lines,
     write_recording,
 )
+from tsgt.estimation import with_noise_scales
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.smoothing import MotionModel
+    from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters
     from tsgt.recording import Recording
@@ -95,7 +96,7 @@ def process(
     loaded = load(
         recording, keep_going=keep_going, estimator=estimator, rate_hz=rate_hz, frames=frames, prisms=prisms
     )
-    poses, parameters, motion = _processed(loaded, recording)
+    poses, parameters, continuous = _processed(loaded, recording)
     with progress("writing poses") as on_progress:
         if format_name == "tum":
             write_lines(output, tum_lines(valid_rows(poses)))
@@ -112,24 +113,24 @@ def process(
         "seconds": time.perf_counter() - started_s,
         "duration_s": duration_s(poses),
         "measurements": len(loaded.measurements),
-        **({} if motion is None else motion_keys(motion)),
+        **({} if continuous is None else motion_keys(continuous)),
     }
     if as_json:
         print_json(result)
         return
     click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements")
-    if motion is not None:
-        click.echo(motion_text(motion))
+    if continuous is not None:
+        click.echo(motion_text(continuous.motion))
 
 
-def _processed(loaded: Recording, path: Path) -> tuple[PoseBatch, Parameters, MotionModel | None]:
-    """Return the poses, the parameters that they were computed with, and the tuned motion prior."""
+def _processed(loaded: Recording, path: Path) -> tuple[PoseBatch, Parameters, SmoothedRecording | None]:
+    """Return the poses, the parameters that they were computed with, and the trajectory of ``continuous``."""
     parameters = loaded.parameters
     if parameters.pipeline.estimator == "linear":
         return process_recording(loaded, path=path), parameters, None
     with progress("fitting", first=TUNING) as on_progress:
         found = smooth_recording(loaded, path=path, on_progress=on_progress)
-    pipeline = dataclasses.replace(
-        parameters.pipeline, motion=found.motion.prior, noise_scale=found.motion.noise_scale
-    )
-    return found.poses, dataclasses.replace(parameters, pipeline=pipeline), found.motion
+    motion = found.motion
+    pipeline = dataclasses.replace(parameters.pipeline, motion=motion.prior)
+    parameters = dataclasses.replace(parameters, pipeline=pipeline)
+    return found.poses, with_noise_scales(parameters, motion.noise_scales, motion.noise_scale), found

@@ -21,6 +21,7 @@ from tsgt.geometry.trajectory import (
     STATE_DIM,
     initial_guess,
     knot_times,
+    overall_scale,
     scale_noise,
     solve,
     tune,
@@ -55,7 +56,8 @@ class MotionCalibration:
     birge_ratio: float
     wander_s: float  # One sigma of each station's latency from segment to segment; included in the covariance
     prior: MotionPrior
-    noise_scale: float  # Factor on the stated noise
+    noise_scales: FloatArray  # (S, 3) factors on the stated noise by station and component
+    noise_scale: float  # Their root mean square over all measurements and components
     measurements: int
     outliers: int
 
@@ -99,7 +101,7 @@ def calibrate_motion(
     *,
     start: Setup | None = None,
     prior: MotionPrior | None = None,
-    noise_scale: float | None = None,
+    noise_scale: FloatArray | float | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> MotionCalibration:
     """Find a set-up from motion.
@@ -127,10 +129,10 @@ def calibrate_motion(
     if prior is None:
         report("motion prior")
         tuned = tune(setup.applied(observations), noise_scale=noise_scale)
-        prior, noise_scale = tuned.prior, tuned.noise_scale
-    noise_scale = 1.0 if noise_scale is None else noise_scale
+        prior, noise_scale = tuned.prior, tuned.noise_scales
+    scales = np.ones((len(observations.frames), 3)) * (1.0 if noise_scale is None else noise_scale)
     report("fine")
-    segments = _segments(scale_noise(observations, noise_scale))
+    segments = _segments(scale_noise(observations, scales))
     setup, system = _search(segments, parameters, setup, prior)
     prior_information = _prior_information(parameters, parameters.local_coordinates(setup))
     wander_s = estimate_wander_s(system.segment_information, prior_information, parameters.latencies)
@@ -147,7 +149,8 @@ def calibrate_motion(
         birge_ratio,
         wander_s,
         prior,
-        noise_scale,
+        scales,
+        overall_scale(observations, scales),
         system.measurements,
         system.outliers,
     )

@@ -13,9 +13,10 @@ from tsgt.geometry.trajectory.gauss_newton import (
     nearest_knots,
     solve,
 )
-from tsgt.geometry.trajectory.hyperparameters import NOISE_FLOOR_SHARE, scale_noise, tune, with_noise_floor
+from tsgt.geometry.trajectory.hyperparameters import NOISE_FLOOR_SHARE, tune, with_noise_floor
 from tsgt.geometry.trajectory.initialisation import initial_guess
 from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations, linearise
+from tsgt.geometry.trajectory.noise_scales import overall_scale, scale_noise
 from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
 from tsgt.geometry.trajectory.states import STATE_DIM, States, concatenate_states
 
@@ -36,6 +37,7 @@ __all__ = [
     "knot_times",
     "linearise",
     "nearest_knots",
+    "overall_scale",
     "ros_covariance",
     "scale_noise",
     "solve",

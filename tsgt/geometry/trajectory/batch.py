@@ -17,12 +17,12 @@ from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest_knots, sol
 from tsgt.geometry.trajectory.hyperparameters import (
     NOISE_FLOOR_SHARE,
     partially_occluded,
-    scale_noise,
     tune,
     with_noise_floor,
 )
 from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
+from tsgt.geometry.trajectory.noise_scales import scale_noise
 from tsgt.geometry.trajectory.query import Trajectory
 from tsgt.geometry.trajectory.states import concatenate_states
 from tsgt.model import MotionPrior
@@ -42,8 +42,8 @@ class TrajectoryFit:
     """A trajectory fitted to measurements."""
 
     trajectory: Trajectory
-    observations: Observations  # The M measurements, their noise scaled by ``noise_scale``
-    noise_scale: float  # Factor on the stated noise of the instruments
+    observations: Observations  # The M measurements, their noise scaled by ``noise_scales``
+    noise_scales: FloatArray  # (S, 3) factors on the stated noise by station and component
     # (M, 3) trajectory minus measurement: along the line of sight, horizontally and vertically across it
     residuals_m: FloatArray
     squared_distances: FloatArray  # (M,) squared Mahalanobis distances of the residuals
@@ -67,7 +67,7 @@ def fit_trajectory(
     *,
     prior: MotionPrior | None = None,
     occluded_prior: MotionPrior | None = None,
-    noise_scale: float | None = None,
+    noise_scale: FloatArray | float | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> TrajectoryFit:
     """Fit a trajectory.
@@ -79,17 +79,18 @@ def fit_trajectory(
     observations : In the order of time, with the stated noise of the instruments.
     prior : Tuned on the measurements when not given.
     occluded_prior : Process-noise floor while fewer than three prisms are observed; ``prior`` when only that is given.
-    noise_scale : Factor on the stated noise; tuned on the measurements when not given.
+    noise_scale : Factor on the stated noise, or factors by station and component, (S, 3); tuned when not given.
     on_progress : Called with the completed share of the work, 0 to 1.
     """
     report_progress = on_progress or (lambda _: None)
     if prior is None or noise_scale is None:
         tuned = tune(observations, start=prior, noise_scale=noise_scale, noise_only=prior is not None)
-        noise_scale = tuned.noise_scale
+        noise_scale = tuned.noise_scales
         if prior is None:
             prior = with_noise_floor(tuned.prior, MotionPrior(), NOISE_FLOOR_SHARE)
             occluded_prior = occluded_prior or MotionPrior()
-    observations = scale_noise(observations, noise_scale)
+    scales = np.ones((len(observations.frames), 3)) * noise_scale
+    observations = scale_noise(observations, scales)
     times_s = knot_times(observations.time_s)
     knot_index = nearest_knots(times_s, observations.time_s)
     sigmas = _sigmas(observations, times_s, prior, occluded_prior or prior)
@@ -125,7 +126,7 @@ def fit_trajectory(
     return TrajectoryFit(
         trajectory,
         observations,
-        noise_scale,
+        scales,
         np.concatenate(residuals_m),
         np.concatenate(squared_distances),
         np.concatenate(weights),

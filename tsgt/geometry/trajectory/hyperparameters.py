@@ -1,4 +1,4 @@
-"""Hyperparameters of the estimator: motion prior, noise scale, and a floor for the process noise. Sans-I/O.
+"""Hyperparameters of the estimator: motion prior, noise, and a floor for the process noise. Sans-I/O.
 
 :func:`tune` maximises the evidence (type-II maximum likelihood); its gradient is that of the expected complete-data log
 likelihood (Fisher's identity). :func:`with_noise_floor` bounds the process noise of a tuned prior: one tuned to minutes of
@@ -7,14 +7,19 @@ straight driving makes the next bend impossible. See docs/explanation/continuous
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.trajectory.gauss_newton import knot_times, log_evidence, solve
+from tsgt.geometry.trajectory.gauss_newton import (
+    REJECTION_THRESHOLD,
+    knot_times,
+    log_evidence,
+    solve,
+)
 from tsgt.geometry.trajectory.initialisation import initial_guess
 from tsgt.geometry.trajectory.motion_prior import (
     axis_correlation_times_s,
@@ -22,6 +27,12 @@ from tsgt.geometry.trajectory.motion_prior import (
     prior_from_axes,
     process_information,
     transition,
+)
+from tsgt.geometry.trajectory.noise_scales import (
+    SCALE_SPREAD,
+    log_scale_gradient,
+    overall_scale,
+    scale_noise,
 )
 from tsgt.geometry.trajectory.states import linearise_process
 from tsgt.model import MotionPrior
@@ -41,9 +52,13 @@ SEGMENTS = 4  # Evenly spread segments that represent a long recording
 MIN_MEASUREMENTS = 30  # Per segment
 _SIGMA_PARAMETERS = np.array([0, 0, 1, 3, 3, 4])  # By axis; x and y share one, roll and pitch too
 _TIME_PARAMETERS = (2, 5)
-_SCALE_PARAMETER = 6
+_SCALE_PARAMETER = (
+    6  # Common factor on the noise; followed by each station's and component's deviation from it
+)
 _LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03, 0.5])
 _UPPER = np.log([30.0, 30.0, 10.0, 30.0, 30.0, 10.0, 20.0])
+_MAX_DEVIATION = np.log(10.0)
+_MEDIAN_SQUARED_DISTANCE = 2.37  # Of the chi-square distribution with 3 degrees of freedom
 _TOLERANCE = 1e-5
 _MAX_STEPS = 40
 _DIFFERENCE_STEP = 1e-3
@@ -54,16 +69,19 @@ class Hyperparameters:
     """Maximum-evidence hyperparameters."""
 
     prior: MotionPrior
-    noise_scale: float  # Factor on the stated noise of the instruments
-    log_evidence: float  # Up to a constant
+    noise_scales: (
+        FloatArray  # (S, 3) factors on the stated noise by station (row of the frames) and component
+    )
+    noise_scale: float  # Their root mean square over all measurements and components
+    log_evidence: float  # Up to a constant; of the measurements and of the deviations of the factors
 
 
 class _Segment:
     """One segment of measurements and its most probable trajectory so far, the initial guess of the next evaluation."""
 
     def __init__(self, observations: Observations) -> None:
-        self.observations = observations
-        self.knots: States = initial_guess(observations, knot_times(observations.time_s))
+        self.observations = _without_blunders(observations)
+        self.knots: States = initial_guess(self.observations, knot_times(self.observations.time_s))
         self.log_evidence = -np.inf
 
     def record(self, knots: States, log_evidence: float) -> None:
@@ -76,7 +94,7 @@ def tune(
     observations: Observations,
     *,
     start: MotionPrior | None = None,
-    noise_scale: float | None = None,
+    noise_scale: FloatArray | float | None = None,
     noise_only: bool = False,
     on_progress: Callable[[int], None] | None = None,
 ) -> Hyperparameters:
@@ -88,16 +106,17 @@ def tune(
     ----------
     observations : In the order of time, with the stated noise.
     start : Initial prior; hardly affects the result.
-    noise_scale : Kept at this value; estimated as well when not given.
-    noise_only : Keep the prior and estimate only the noise scale.
+    noise_scale : Kept at this value, or these of (S, 3); estimated as well when not given.
+    noise_only : Keep the prior and estimate only the noise.
     on_progress : Called with the number of evaluations.
     """
-    initial = log_parameters(
-        MotionPrior() if start is None else start, 1.0 if noise_scale is None else noise_scale
-    )
-    lower, upper = np.minimum(_LOWER, initial), np.maximum(_UPPER, initial)
+    scales = np.ones((len(observations.frames), 3)) * (1.0 if noise_scale is None else noise_scale)
+    initial = log_parameters(MotionPrior() if start is None else start, scales)
+    deviations = np.full(scales.size, _MAX_DEVIATION)
+    lower = np.minimum(np.concatenate([_LOWER, -deviations]), initial)
+    upper = np.maximum(np.concatenate([_UPPER, deviations]), initial)
     if noise_scale is not None:
-        lower[_SCALE_PARAMETER] = upper[_SCALE_PARAMETER] = initial[_SCALE_PARAMETER]
+        lower[_SCALE_PARAMETER:] = upper[_SCALE_PARAMETER:] = initial[_SCALE_PARAMETER:]
     if noise_only:
         lower[:_SCALE_PARAMETER] = upper[:_SCALE_PARAMETER] = initial[:_SCALE_PARAMETER]
     return maximise_evidence(observations, initial, lower, upper, on_progress=on_progress)
@@ -111,7 +130,7 @@ def maximise_evidence(
     *,
     on_progress: Callable[[int], None] | None = None,
 ) -> Hyperparameters:
-    """Maximise the evidence by L-BFGS-B; bounds and start: log parameters, (7,), of :func:`log_parameters`; as :func:`tune`."""
+    """Maximise the evidence by L-BFGS-B; bounds and start: parameters of :func:`log_parameters`; as :func:`tune`."""
     segments = _segments(observations)
     evaluations = 0
     # Per measurement: the first step of the search is then of order one, a factor of e in a parameter.
@@ -122,10 +141,11 @@ def maximise_evidence(
         evaluations += 1
         if on_progress is not None:
             on_progress(evaluations)
-        parts = [_evidence(segment, parameters) for segment in segments]
-        return -per_measurement * sum(value for value, _ in parts), -per_measurement * np.sum(
-            [part for _, part in parts], axis=0
-        )
+        value, gradient = _log_hyperprior(parameters)
+        for segment in segments:
+            part, part_gradient = _evidence(segment, parameters)
+            value, gradient = value + part, gradient + part_gradient
+        return -per_measurement * value, -per_measurement * gradient
 
     found = minimize(
         negative,
@@ -135,13 +155,10 @@ def maximise_evidence(
         bounds=list(zip(lower, upper, strict=True)),
         options={"maxiter": _MAX_STEPS, "ftol": _TOLERANCE},
     )
-    prior, noise_scale = _from_log_parameters(found.x)
-    return Hyperparameters(prior, noise_scale, -float(found.fun) / per_measurement)
-
-
-def scale_noise(observations: Observations, scale: float) -> Observations:
-    """Return measurements with their noise scaled."""
-    return replace(observations, sigmas_m=observations.sigmas_m * scale)
+    prior, scales = _from_log_parameters(found.x)
+    return Hyperparameters(
+        prior, scales, overall_scale(observations, scales), -float(found.fun) / per_measurement
+    )
 
 
 def _segments(observations: Observations) -> list[_Segment]:
@@ -167,40 +184,54 @@ def _segments(observations: Observations) -> list[_Segment]:
     return found
 
 
-def log_parameters(prior: MotionPrior, scale: float) -> FloatArray:
-    """(7,) logarithms of: acceleration sigmas x and z and correlation time, the same of the rotation, noise scale."""
+def _without_blunders(observations: Observations) -> Observations:
+    """Remove measurements of something else, which say nothing about the noise: a few of them would double a factor."""
+    guess = initial_guess(observations, knot_times(observations.time_s))
+    squared = solve(observations, guess, MotionPrior(), reject_outliers=False).squared_distances
+    scale_squared = max(float(np.median(squared)) / _MEDIAN_SQUARED_DISTANCE, 1.0)
+    return observations.select(squared <= REJECTION_THRESHOLD**2 * scale_squared)
+
+
+def log_parameters(prior: MotionPrior, scales: FloatArray) -> FloatArray:
+    """(7 + 3 S,) logarithms of prior and noise scales, (S, 3).
+
+    Acceleration sigmas x and z and correlation time, the same of the rotation, the common factor on the noise, and each
+    factor's deviation from it.
+    """
     sigmas = axis_sigmas(prior)
     x, _, z, roll, _, yaw = sigmas
-    return np.log(
-        [
-            x,
-            z,
-            prior.acceleration_correlation_time_s,
-            roll,
-            yaw,
-            prior.angular_acceleration_correlation_time_s,
-            scale,
-        ]
-    )
+    times_s = prior.acceleration_correlation_time_s, prior.angular_acceleration_correlation_time_s
+    motion = np.log([x, z, times_s[0], roll, yaw, times_s[1]])
+    log_scales = np.log(scales).ravel()
+    return np.concatenate([motion, [log_scales.mean()], log_scales - log_scales.mean()])
 
 
-def _from_log_parameters(parameters: FloatArray) -> tuple[MotionPrior, float]:
+def _from_log_parameters(parameters: FloatArray) -> tuple[MotionPrior, FloatArray]:
     values = np.exp(parameters)
-    return prior_from_axes(list(values[_SIGMA_PARAMETERS]), list(values[list(_TIME_PARAMETERS)])), float(
-        values[_SCALE_PARAMETER]
-    )
+    scales = values[_SCALE_PARAMETER] * values[_SCALE_PARAMETER + 1 :].reshape(-1, 3)
+    return prior_from_axes(list(values[_SIGMA_PARAMETERS]), list(values[list(_TIME_PARAMETERS)])), scales
+
+
+def _log_hyperprior(parameters: FloatArray) -> tuple[float, FloatArray]:
+    """Log density of the factors' deviations from the common one, and its gradient."""
+    gradient = np.zeros_like(parameters)
+    deviations = parameters[_SCALE_PARAMETER + 1 :] / SCALE_SPREAD
+    gradient[_SCALE_PARAMETER + 1 :] = -deviations / SCALE_SPREAD
+    return -0.5 * float(deviations @ deviations), gradient
 
 
 def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatArray]:
     """Log evidence of one segment and its gradient by the log parameters."""
-    prior, scale = _from_log_parameters(parameters)
-    observations = scale_noise(segment.observations, scale)
+    prior, scales = _from_log_parameters(parameters)
+    observations = scale_noise(segment.observations, scales)
     solution = solve(observations, segment.knots, prior, reject_outliers=False)
     value = log_evidence(solution, observations, prior)
     segment.record(solution.knots, value)
     covariance, cross_covariance = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
-    gradient[_SCALE_PARAMETER] = _noise_scale_gradient(solution, observations, covariance)
+    by_scale = log_scale_gradient(solution, observations, covariance)
+    gradient[_SCALE_PARAMETER] = by_scale.sum()
+    gradient[_SCALE_PARAMETER + 1 :] = by_scale.ravel()
     moments = _expected_moments(solution, covariance, cross_covariance)
     sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
     energies = _expected_squared_distances(moments, solution.process.phi, solution.process.information)
@@ -220,18 +251,6 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatAr
     expected = (first**2 + np.diag(covariance[0])[12:]) / sigmas**2 - 1.0
     np.add.at(gradient, _SIGMA_PARAMETERS, expected)
     return value, gradient
-
-
-def _noise_scale_gradient(solution: Solution, observations: Observations, covariance: FloatArray) -> float:
-    """Differentiate by the log noise scale: expected squared Mahalanobis distances minus their number."""
-    linearised = solution.linearised
-    information = np.linalg.inv(linearised.covariance(observations))
-    by_state = linearised.jacobian
-    spread_m2 = by_state @ covariance[solution.knot_index] @ np.swapaxes(by_state, 1, 2)
-    expected = solution.squared_distances + np.einsum("mij,mji->m", information, spread_m2)
-    # The part of the covariance due to time noise does not scale.
-    share = np.einsum("mii,mi->m", information, observations.sigmas_m**2) / 3.0
-    return float((share * (solution.weights * expected - 3.0)).sum())
 
 
 _Moments = tuple["FloatArray", "FloatArray", "FloatArray"]

@@ -97,6 +97,10 @@ def test_tuned_motion_prior_is_recorded(tsgt: Tsgt, recording: Path) -> None:
     assert result["motion_tuned"] is True
     assert parameters["pipeline"]["motion"] == result["motion"]
     assert parameters["pipeline"]["noise_scale"] == result["noise_scale"]
+    station, factors = parameters["stations"][0], result["noise_scales"]["1"]
+    assert [result["noise_scale"] * factor for factor in station["noise_scale"]] == pytest.approx(
+        [factors["range"], factors["horizontal_angle"], factors["zenith_angle"]]
+    )
     text = tsgt("process", recording, "--estimator", "continuous", "--output", output).out
     assert f"  noise_scale = {result['noise_scale']:.3g}\n  [pipeline.motion]\n" in text
     assert (

@@ -137,7 +137,8 @@ def test_evidence_gradient_agrees_with_differences(observations: Observations) -
     """Central differences of the evidence; the noise scale deviates slightly where timestamps are uncertain."""
     exact = replace(observations, time_sigma_s=np.zeros(len(observations)))
     segment = hyperparameters._Segment(exact.select(slice(0, 150)))
-    at = np.log([0.3, 0.15, 0.5, 0.12, 0.2, 0.4, 1.2])
+    rng = np.random.default_rng(3)
+    at = np.concatenate([np.log([0.3, 0.15, 0.5, 0.12, 0.2, 0.4, 1.2]), rng.uniform(-0.5, 0.5, 9)])
     hyperparameters._evidence(segment, at)
     _, gradient = hyperparameters._evidence(segment, at)
     step = 1e-3
@@ -163,6 +164,21 @@ def test_tuning_recovers_the_prior(observations: Observations) -> None:
         DRAWN_PRIOR.angular_acceleration_correlation_time_s, rel=0.5
     )
     assert found.noise_scale == pytest.approx(2.0, rel=0.15)
+
+
+def test_noise_is_tuned_by_station_and_component() -> None:
+    """Factors of one to three, different for each station and component, are recovered where the robot moves calmly."""
+    calm = replace(
+        DRAWN_PRIOR,
+        acceleration_sigma_mps2=(0.05, 0.05, 0.05),
+        angular_acceleration_sigma_radps2=(0.05, 0.05, 0.05),
+    )
+    motion = draw_motions(calm, count=1, duration_s=61.0, seed=11)[0]
+    observations = sorted_by_time(measure(motion, until_s=60.0, seed=12))
+    true = np.array([[1.0, 2.0, 1.5], [3.0, 1.0, 1.0], [1.0, 1.0, 3.0]])
+    found = tune(scale_noise(observations, 1.0 / true), start=calm)
+    assert found.noise_scales == pytest.approx(true, rel=0.25)
+    assert found.noise_scale == pytest.approx(np.sqrt(np.mean(true**2)), rel=0.1)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ import numpy as np
 
 from tsgt.analysis.calibration import calibrate_recording
 from tsgt.geometry import exp_so3
-from tsgt.geometry.calibration import Setup, SetupPrior
+from tsgt.geometry.calibration import SetupPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -55,14 +55,16 @@ def evaluate(name: str, recording: Recording, rng: np.random.Generator) -> tuple
     late_s[1] = LATE_S
     unknowns = found.parameters
     error = unknowns.local_coordinates(found.setup) - unknowns.local_coordinates(
-        Setup(frames, late_s, found.setup.layout)
+        replace(found.setup, frames=frames, latencies_s=late_s)
     )
-    sigmas = error / np.sqrt(np.diag(found.covariance))
-    squared = float(error @ np.linalg.solve(found.covariance, error))
     largest = [
         1e3 * np.abs(error[at]).max()
         for at in (unknowns.translations, unknowns.rotations, unknowns.latencies)
     ]
+    free = found.prior_sigmas > 0
+    error, covariance = error[free], found.covariance[np.ix_(free, free)]
+    sigmas = error / np.sqrt(np.diag(covariance))
+    squared = float(error @ np.linalg.solve(covariance, error))
     print(
         name,
         "{:.2f} mm {:.3f} mrad {:.2f} ms".format(*largest),

@@ -157,16 +157,14 @@ def _stations(found: CalibratedRecording) -> dict[int, dict[str, Any]]:
     result = {}
     for place, row in enumerate(unknowns.stations):
         parameters = found.parameters.stations[row]
-        late = sigmas[unknowns.latencies[place]] if len(unknowns.latencies) else 0.0
-        turn_sigmas = np.zeros(3)
-        turn_sigmas[3 - unknowns.rotations.shape[1] :] = sigmas[unknowns.rotations[place]]
+        late = sigmas[unknowns.latencies[place]]
         result[parameters.station] = {
             "correction_mm": 1e3 * float(np.linalg.norm(shifts_m[row])),
             "correction_mrad": 1e3 * float(np.linalg.norm(turns_rad[row])),
             "correction_xyz_mm": (1e3 * shifts_m[row]).tolist(),
             "correction_xyz_mrad": (1e3 * turns_rad[row]).tolist(),
             "sigma_mm": (1e3 * sigmas[unknowns.translations[place]]).tolist(),
-            "sigma_mrad": (1e3 * turn_sigmas).tolist(),
+            "sigma_mrad": (1e3 * sigmas[unknowns.rotations[place]]).tolist(),
             "latency_ms": parameters.latency_ns / 1e6,
             "latency_correction_ms": 1e3 * float(calibration.setup.latencies_s[row]),
             "latency_sigma_ms": 1e3 * float(late),
@@ -216,7 +214,7 @@ def _print(
         f"{calibration.measurements} measurements, {calibration.outliers} outliers, "
         f"noise scale {calibration.noise_scale:.2f}; sigmas scaled by {calibration.birge_ratio:.2f} (Birge ratio of parts of the recording)"
     )
-    if len(calibration.parameters.latencies):
+    if calibration.prior_sigmas[calibration.parameters.latencies].any():
         click.echo(f"wander of the timestamps of a station: {1e3 * calibration.wander_s:.2f} ms")
     rows = []
     for station, each in stations.items():

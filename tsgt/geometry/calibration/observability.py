@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.calibration.motion_parameters import about_axes, deformation_modes
 from tsgt.geometry.polar import cartesian_to_polar
 
 if TYPE_CHECKING:
@@ -34,21 +33,22 @@ class UnobservableDirection:
 def unobservable_directions(calibration: MotionCalibration) -> list[UnobservableDirection]:
     """Directions whose uncertainty exceeds the limits, largest first: eigenvectors of the scaled covariance."""
     parameters = calibration.parameters
-    limits = np.empty(len(parameters.sigmas))
+    limits = np.full(parameters.count, np.inf)
     limits[parameters.translations] = TRANSLATION_LIMIT_M
     limits[parameters.rotations] = ROTATION_LIMIT_RAD
     limits[parameters.latencies] = LATENCY_LIMIT_S
     limits[parameters.prisms] = PRISM_LIMIT_M
-    limits = np.minimum(limits, 0.5 * parameters.sigmas)
-    values, vectors = np.linalg.eigh(calibration.covariance / np.outer(limits, limits))
+    free = np.flatnonzero(np.isfinite(limits) & (calibration.prior_sigmas > 0))
+    scale = np.minimum(limits, 0.5 * calibration.prior_sigmas)[free]
+    values, vectors = np.linalg.eigh(calibration.covariance[np.ix_(free, free)] / np.outer(scale, scale))
     directions = []
-    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
+    for value, free_vector in zip(values[::-1], vectors.T[::-1], strict=True):
         if value <= 1.0:
             break
         excess = float(np.sqrt(value))
-        directions.append(
-            UnobservableDirection(_describe(calibration, vector, excess * limits * vector), excess)
-        )
+        vector, sigma = np.zeros((2, parameters.count))
+        vector[free], sigma[free] = free_vector, excess * scale * free_vector
+        directions.append(UnobservableDirection(_describe(calibration, vector, sigma), excess))
     return directions
 
 
@@ -60,28 +60,21 @@ def _describe(calibration: MotionCalibration, vector: FloatArray, sigma: FloatAr
     components: list[tuple[float, str]] = []
     for i, station in enumerate(parameters.stations):
         name = f"station {station + 1}"
-        if len(parameters.translations):
-            at = parameters.translations[i]
-            size_mm, towards = 1e3 * np.linalg.norm(sigma[at]), _direction(sigma[at])
-            components.append(
-                (float(np.linalg.norm(vector[at])), f"{name} shifts by {size_mm:.2g} mm {towards}")
-            )
-            at = parameters.rotations[i]
-            size_mrad, axis = 1e3 * np.linalg.norm(sigma[at]), _direction(about_axes(sigma[at]))
-            text = f"{name} turns by {size_mrad:.2g} mrad about {axis}"
-            components.append((float(np.linalg.norm(vector[at])), text))
-        if len(parameters.latencies):
-            at = parameters.latencies[i]
-            components.append((abs(vector[at]), f"{name} is late by {1e3 * sigma[at]:.2g} ms"))
-    if len(parameters.prisms):
-        modes = deformation_modes(calibration.setup.layout)
-        displacements = (modes @ sigma[parameters.prisms]).reshape(-1, 3)
-        weight = float(np.linalg.norm(vector[parameters.prisms]))
-        lengths = np.linalg.norm(displacements, axis=1)
-        for prism, length in enumerate(lengths):
-            x, y, z = 1e3 * displacements[prism]
+        shift, turn, late = parameters.translations[i], parameters.rotations[i], parameters.latencies[i]
+        if vector[shift].any():
+            text = f"{name} shifts by {1e3 * np.linalg.norm(sigma[shift]):.2g} mm {_direction(sigma[shift])}"
+            components.append((float(np.linalg.norm(vector[shift])), text))
+        if vector[turn].any():
+            size_mrad = 1e3 * np.linalg.norm(sigma[turn])
+            text = f"{name} turns by {size_mrad:.2g} mrad about {_direction(sigma[turn])}"
+            components.append((float(np.linalg.norm(vector[turn])), text))
+        if vector[late]:
+            components.append((abs(vector[late]), f"{name} is late by {1e3 * sigma[late]:.2g} ms"))
+    for prism, at in enumerate(parameters.prisms):
+        if vector[at].any():
+            x, y, z = 1e3 * sigma[at]
             text = f"prism {prism + 1} moves on the robot by ({x:.2g}, {y:.2g}, {z:.2g}) mm"
-            components.append((weight * float(length / lengths.max()), text))
+            components.append((float(np.linalg.norm(vector[at])), text))
     smallest = MIN_COMPONENT_SHARE * max(weight for weight, _ in components)
     described = sorted((part for part in components if part[0] >= smallest), key=lambda part: -part[0])
     return ", ".join(text for _, text in described)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
 
+MIN_DISAGREEMENT_FREEDOM = 5.0  # Degrees of freedom below which the segments' disagreement says nothing
 MIN_WANDER_S = 1e-5
 MAX_WANDER_S = 0.1  # Bounds of the search: less is invisible with any instrument, more is no wander
 
@@ -64,19 +65,24 @@ def eliminate_wander(
 
 
 def estimate_wander_s(
-    segments: Sequence[SegmentInformation], prior: SegmentInformation, latencies: NDArray[np.intp]
+    segments: Sequence[SegmentInformation],
+    factor: FloatArray,
+    deviation: FloatArray,
+    latencies: NDArray[np.intp],
 ) -> float:
     """Return one sigma of the wander of latencies between segments; 0 without evidence for it.
 
-    ``segments`` and the ``prior`` are linearised at one set-up; ``latencies``, (n,), are the rows of the latencies.
+    ``segments`` are linearised at one set-up, which differs from the prior's mean by ``factor @ deviation``; ``factor``,
+    (G, r): of the prior covariance; ``latencies``, (n,): rows of the latencies.
     """
-    if not len(latencies) or len(segments) < 2:
+    if not len(latencies) or not factor[latencies].any() or len(segments) < 2:
         return 0.0
 
     def negative(log_wander: float) -> float:
         eliminated = [eliminate_wander(segment, latencies, float(np.exp(log_wander))) for segment in segments]
-        information = prior.information + sum(each.segment.information for each in eliminated)
-        gradient = prior.gradient + sum(each.segment.gradient for each in eliminated)
+        total = np.sum([each.segment.information for each in eliminated], axis=0)
+        information = np.eye(factor.shape[1]) + factor.T @ total @ factor
+        gradient = deviation + factor.T @ np.sum([each.segment.gradient for each in eliminated], axis=0)
         log_likelihood = sum(each.cost_reduction + 0.5 * each.log_determinant for each in eliminated)
         log_likelihood += 0.5 * float(gradient @ np.linalg.solve(information, gradient))
         return -float(log_likelihood - 0.5 * np.linalg.slogdet(information)[1])
@@ -85,3 +91,25 @@ def estimate_wander_s(
     found = minimize_scalar(negative, bounds=bounds, method="bounded", options={"xatol": 0.01})
     # Without evidence the search stops just short of the lower bound.
     return float(np.exp(found.x)) if found.fun < negative(bounds[0]) - 1e-6 else 0.0
+
+
+def birge_ratio(segments: Sequence[SegmentInformation], factor: FloatArray) -> float:
+    """Birge ratio of segments, at their joint optimum: their disagreement over what noise explains, at least 1.
+
+    R. T. Birge, Physical Review 40, 1932. ``factor``, (G, r): of the prior covariance.
+    """
+    joint = _posterior(np.sum([each.information for each in segments], axis=0), factor)
+    squared = expected = 0.0
+    for information, gradient in segments:
+        covariance = _posterior(information, factor)
+        squared += float(gradient @ covariance @ gradient)
+        # The common optimum takes its share of each segment's disagreement.
+        expected += float(np.trace(covariance @ (information - information @ joint @ information)))
+    return max(1.0, float(np.sqrt(squared / expected))) if expected >= MIN_DISAGREEMENT_FREEDOM else 1.0
+
+
+def _posterior(information: FloatArray, factor: FloatArray) -> FloatArray:
+    """(G, G) covariance of the parameters from information and a prior."""
+    inverse = np.linalg.inv(np.eye(factor.shape[1]) + factor.T @ information @ factor)
+    covariance: FloatArray = factor @ inverse @ factor.T
+    return covariance

@@ -383,11 +383,15 @@ class PipelineParameters(FiniteNumbers):
     lag_ns: int = 3_000_000_000
     """Lag of the smoothed poses in ns; measurements that arrive later after they were made are not used. For
     ``continuous``."""
-    position_sigma_limit_m: float = 0.1
-    """A pose whose position (of the prisms' centroid, in its least certain direction) has a sigma above this is
+    position_sigma_limit_m: float = 0.05
+    """A smoothed pose whose position (of the reference point, in its least certain direction) has a sigma above this is
     invalid. For ``continuous``."""
-    rotation_sigma_limit_rad: float = math.radians(5.0)
+    rotation_sigma_limit_rad: float = math.radians(2.0)
     """The same for the sigma of its rotation. For ``continuous``."""
+    predicted_position_sigma_limit_m: float = 0.15
+    """As ``position_sigma_limit_m``, for predicted poses."""
+    predicted_rotation_sigma_limit_rad: float = math.radians(5.0)
+    """The same for the sigma of their rotation."""
 
     def __post_init__(self) -> None:
         """Reject limits that nothing can be computed with."""
@@ -404,6 +408,8 @@ class PipelineParameters(FiniteNumbers):
             lag_ns=(0, 60_000_000_000),
             position_sigma_limit_m=(0, 1e6),
             rotation_sigma_limit_rad=(0, math.pi),
+            predicted_position_sigma_limit_m=(0, 1e6),
+            predicted_rotation_sigma_limit_rad=(0, math.pi),
         )
 
 

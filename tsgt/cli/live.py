@@ -16,7 +16,7 @@ from tsgt.cli.render import render
 from tsgt.clock import SystemClock
 from tsgt.errors import RecordingError, StreamError
 from tsgt.master.stream_server import StreamServer
-from tsgt.recording import HelloRecord, Typed, decode, encode_line
+from tsgt.recording import Typed, decode, encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -74,8 +74,8 @@ def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep
     stream is identical to the last bit at any speed. The replay waits for slow readers.
     """
     # Imported here, so that `tsgt listen` starts without numpy.
+    from tsgt.master.replay import greeting, replayed
     from tsgt.master.replay import replay as play
-    from tsgt.master.replay import replayed
 
     arrivals = replayed(recording, keep_going=keep_going, on_problem=report_problem)
     first = next(arrivals, None)
@@ -83,7 +83,9 @@ def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep
         raise RecordingError("holds nothing to replay: no measurement, status or event", path=recording)
 
     async def serve() -> int:
-        async with StreamServer(socket_path, encode_line(HelloRecord())) as server:
+        async with StreamServer(
+            socket_path, encode_line(greeting(recording, keep_going=keep_going))
+        ) as server:
             if wait:
                 click.echo(f"waiting for a reader: tsgt listen --socket {socket_path}", err=True)
                 await server.wait_for_reader()

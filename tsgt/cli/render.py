@@ -15,6 +15,7 @@ from tsgt.recording import (
     PoseRecord,
     StationStatus,
     StatusRecord,
+    ValidityLimits,
     decode,
 )
 
@@ -59,9 +60,25 @@ def render(kind: str, line: bytes) -> str | None:
 
 def _hello(hello: HelloRecord) -> str:
     text = f"tsgt {hello.version}, stream protocol {hello.protocol}: {', '.join(hello.capabilities)}"
+    if hello.limits is not None:
+        text += f"\nvalid: {hello.limits.promise}{_limits(hello.limits)}"
     if hello.protocol != PROTOCOL_VERSION:
         text += f" (this program is made for protocol {PROTOCOL_VERSION}; values may be wrong, use a matching tsgt listen)"
     return text
+
+
+def _limits(limits: ValidityLimits) -> str:
+    """Return the limits of the sigmas, if there are any."""
+    kinds = (
+        ("smoothed", limits.position_sigma_m, limits.rotation_sigma_rad),
+        ("predicted", limits.predicted_position_sigma_m, limits.predicted_rotation_sigma_rad),
+    )
+    parts = [
+        f"{kind} {1e3 * position_m:g} mm, {math.degrees(rotation_rad):.3g} deg"
+        for kind, position_m, rotation_rad in kinds
+        if position_m is not None and rotation_rad is not None
+    ]
+    return f" Limits at {limits.reference_point}: {'; '.join(parts)}." if parts else ""
 
 
 def _polar(polar: PolarMeasurement) -> str:
@@ -82,6 +99,8 @@ def _point(point: PointMeasurement) -> str:
 
 def _pose(pose: PoseRecord) -> str:
     validity = "valid" if pose.valid else f"invalid ({pose.reason})"
+    if pose.degraded_by:
+        validity += f", degraded ({', '.join(pose.degraded_by)})"
     parts = [clock_time(pose.stamp_ns), "pose", pose.kind, validity]
     if pose.position_m is not None and pose.orientation_xyzw is not None:
         yaw, pitch, roll = yaw_pitch_roll_deg(pose.orientation_xyzw)

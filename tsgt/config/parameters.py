@@ -121,6 +121,8 @@ def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
         lag_ns=round(pipeline.lag_s * 1e9),
         position_sigma_limit_m=pipeline.position_sigma_limit_mm / 1e3,
         rotation_sigma_limit_rad=math.radians(pipeline.rotation_sigma_limit_deg),
+        predicted_position_sigma_limit_m=pipeline.predicted_position_sigma_limit_mm / 1e3,
+        predicted_rotation_sigma_limit_rad=math.radians(pipeline.predicted_rotation_sigma_limit_deg),
     )
 
 

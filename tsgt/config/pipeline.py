@@ -52,7 +52,11 @@ class PipelineConfig(Model):
     """Factor on the noise of all instruments; for `continuous`."""
     lag_s: Annotated[float, Field(gt=0, le=60)] = 3.0
     """Lag after which a live pose is smoothed and final; for `continuous`."""
-    position_sigma_limit_mm: Positive = 100.0
-    """Maximum position sigma of a valid pose; for `continuous`."""
-    rotation_sigma_limit_deg: Annotated[float, Field(gt=0, le=180)] = 5.0
-    """Maximum rotation sigma of a valid pose; for `continuous`."""
+    position_sigma_limit_mm: Positive = 50.0
+    """Maximum position sigma of a valid smoothed pose, at the reference point; for `continuous`."""
+    rotation_sigma_limit_deg: Annotated[float, Field(gt=0, le=180)] = 2.0
+    """Maximum rotation sigma of a valid smoothed pose; for `continuous`."""
+    predicted_position_sigma_limit_mm: Positive = 150.0
+    """Maximum position sigma of a valid predicted pose, at the reference point; for `continuous`."""
+    predicted_rotation_sigma_limit_deg: Annotated[float, Field(gt=0, le=180)] = 5.0
+    """Maximum rotation sigma of a valid predicted pose; for `continuous`."""

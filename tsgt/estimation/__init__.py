@@ -10,7 +10,7 @@ from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
 from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
-from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
+from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.reference_point import (
     centroid_at_point,
@@ -34,6 +34,7 @@ from tsgt.estimation.tracks import (
 __all__ = [
     "MAX_DISTANCE_M",
     "ContinuousPoseOutput",
+    "Degradation",
     "Kind",
     "LinearEstimator",
     "LiveEstimator",

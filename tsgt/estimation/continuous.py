@@ -150,15 +150,17 @@ class ContinuousEstimator:
     def _predicted(self, epochs_ns: range) -> PoseBatch:
         if not self._window.initialised:
             return self._poses.predicted(epochs_ns, self._history, None, _NONE)
-        converged = np.full(len(epochs_ns), self._window.converged and not self._window.ambiguous)
-        found = [
-            self._window.predict((epoch_ns - self._origin_ns) / 1e9, dim=_POSE_DIM) for epoch_ns in epochs_ns
-        ]
-        if len(found) == 1:
-            return self._poses.predicted(epochs_ns, self._history, *found[0], converged=converged)
-        states = concatenate_states([state for state, _ in found])
-        covariance = np.concatenate([each for _, each in found])
-        return self._poses.predicted(epochs_ns, self._history, states, covariance, converged=converged)
+        time_s = (np.array(epochs_ns, dtype=np.int64) - self._origin_ns) / 1e9
+        converged = np.full(len(time_s), self._window.converged and not self._window.ambiguous)
+        ambiguous = self._window.recently_ambiguous_at(time_s)
+        found = [self._window.predict(each_s, dim=_POSE_DIM) for each_s in time_s.tolist()]
+        states, covariance = found[0]
+        if len(found) > 1:
+            states = concatenate_states([state for state, _ in found])
+            covariance = np.concatenate([each for _, each in found])
+        return self._poses.predicted(
+            epochs_ns, self._history, states, covariance, converged=converged, ambiguous=ambiguous
+        )
 
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
         """Return the smoothed poses of the epochs up to an instant, and discard what only they needed."""
@@ -167,15 +169,18 @@ class ContinuousEstimator:
             return self._none
         states: States | None = None
         covariance = _NONE
-        if self._window.initialised:
-            states, covariance = self._window.trajectory().at(
-                (stamp_ns - self._origin_ns) / 1e9, dim=_POSE_DIM
-            )
         time_s = (stamp_ns - self._origin_ns) / 1e9
+        if self._window.initialised:
+            states, covariance = self._window.trajectory().at(time_s, dim=_POSE_DIM)
         reliable = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)
         reliable &= ~self._window.ambiguous_at(time_s)
         poses = self._poses.smoothed(
-            stamp_ns, self._history, states, covariance, converged=reliable & self._window.converged
+            stamp_ns,
+            self._history,
+            states,
+            covariance,
+            converged=reliable & self._window.converged,
+            ambiguous=self._window.recently_ambiguous_at(time_s),
         )
         self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
         self._discard_old()

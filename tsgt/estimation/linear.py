@@ -16,6 +16,7 @@ import numpy as np
 
 from tsgt.estimation.completeness import CompletenessTracker
 from tsgt.estimation.pose_batch import PoseBatch, Reason
+from tsgt.estimation.pose_quality import degradations
 from tsgt.estimation.reference_point import poses_at
 from tsgt.estimation.tracks import Track, build_tracks, has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import (
@@ -190,6 +191,7 @@ class LinearEstimator:
         usable_rows = np.flatnonzero(batch.valid)
         if len(usable_rows):
             self._fit(batch, usable_rows, samples, between)
+        batch.degraded[:] = degradations(batch, np.zeros((len(batch), 2)), self._limits)
         return poses_at(batch, self._parameters.reference_point)
 
     def _describe(self, batch: PoseBatch, tracks: Sequence[Track], between: Interpolated) -> None:

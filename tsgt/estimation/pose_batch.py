@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
@@ -35,6 +35,23 @@ class Reason(IntEnum):
         return cast("stream_records.Reason", self.name.lower() if self else "")
 
 
+class Degradation(IntFlag):
+    """What degrades a valid pose."""
+
+    PRISM_MISSING = 1
+    OLD_MEASUREMENTS = 2
+    UNCERTAIN = 4
+    AMBIGUOUS = 8
+    RESIDUAL = 16
+
+
+def degradation_words(value: int) -> tuple[stream_records.Degradation, ...]:
+    """Return the words on the stream of a value of :class:`Degradation`."""
+    return tuple(
+        cast("stream_records.Degradation", str(each.name).lower()) for each in Degradation if each & value
+    )
+
+
 class Kind(IntEnum):
     """How a pose was computed."""
 
@@ -60,6 +77,7 @@ class PoseBatch:
     stamp_ns: NDArray[np.int64]  # (N,) epochs on the master's Unix clock
     kind: NDArray[np.int8]  # (N,) values of :class:`Kind`
     reason: NDArray[np.int8]  # (N,) values of :class:`Reason`
+    degraded: NDArray[np.int8]  # (N,) values of :class:`Degradation` of valid poses; 0: good
     position_m: NDArray[np.float64]  # (N, 3) of the reference point in the frame ``station1``
     orientation_xyzw: NDArray[np.float64]  # (N, 4) of its axes in the frame ``station1``
     covariance: NDArray[np.float64]
@@ -86,6 +104,7 @@ class PoseBatch:
             stamp_ns=stamp_ns,
             kind=np.full(n, int(kind), np.int8),
             reason=np.zeros(n, np.int8),
+            degraded=np.zeros(n, np.int8),
             position_m=np.full((n, 3), np.nan),
             orientation_xyzw=np.full((n, 4), np.nan),
             covariance=np.full((n, 6, 6), np.nan),
@@ -139,11 +158,13 @@ class PoseBatch:
             return
         computed = np.isfinite(self.position_m[:, 0])
         reasons, kinds = [reason.word for reason in Reason], [kind.word for kind in Kind]
+        degradations = [degradation_words(value) for value in range(2 * max(Degradation))]
         # One conversion to Python numbers per array, not per element.
         rows = zip(
             self.stamp_ns.tolist(),
             self.kind.tolist(),
             self.reason.tolist(),
+            self.degraded.tolist(),
             computed.tolist(),
             self.position_m.tolist(),
             self.orientation_xyzw.tolist(),
@@ -155,7 +176,7 @@ class PoseBatch:
             self._shares(),
             strict=True,
         )
-        for stamp, kind, reason, known, *arrays, residual, shares in rows:
+        for stamp, kind, reason, degraded, known, *arrays, residual, shares in rows:
             position, orientation, covariance, common, velocity, angular_velocity = (
                 tuple(array) if known else None for array in arrays
             )
@@ -175,6 +196,8 @@ class PoseBatch:
                 kind=kinds[kind],
                 valid=reason == Reason.VALID,
                 reason=reasons[reason],
+                quality="invalid" if reason else "degraded" if degraded else "good",
+                degraded_by=degradations[degraded],
                 residual_m=None if math.isnan(residual) else residual,
                 stations=shares,
             )

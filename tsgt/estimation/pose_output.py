@@ -12,6 +12,7 @@ import numpy as np
 
 from tsgt.estimation.observations import centroid_m
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
+from tsgt.estimation.pose_quality import degradations, sigma_limits, worst_sigma
 from tsgt.estimation.reference_point import poses_at
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.geometry.trajectory import ros_covariance, state_at_point, with_second_order_terms
@@ -86,6 +87,7 @@ class ContinuousPoseOutput:
         covariance: NDArray[np.float64],
         *,
         converged: NDArray[np.bool_] | None = None,
+        ambiguous: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
         """Return poses from earlier measurements, as :meth:`smoothed`; live a single epoch is looked up without arrays."""
         batch = PoseBatch.blank(np.array(stamps_ns, dtype=np.int64), self._prisms, Kind.PREDICTED)
@@ -97,7 +99,7 @@ class ContinuousPoseOutput:
                     batch.prism_residual_m[row, column],
                     batch.prism_reason[row, column],
                 ) = self._latest(history.by_prism[column], home_station, stamp_ns)
-        return self._with_poses(batch, states, covariance, converged=converged)
+        return self._with_poses(batch, states, covariance, converged=converged, ambiguous=ambiguous)
 
     def smoothed(
         self,
@@ -107,10 +109,11 @@ class ContinuousPoseOutput:
         covariance: NDArray[np.float64],
         *,
         converged: NDArray[np.bool_] | None = None,
+        ambiguous: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
         """Return poses of the reference point from measurements on both sides of their epochs.
 
-        A pose is valid while the sigmas of its position at the prisms' centroid and of its rotation, each in its least
+        A pose is valid while the sigmas of its position at the reference point and of its rotation, each in its least
         certain direction, are within the limits, and the prisms' residuals are. The reason of an uncertain pose is that
         of a missing prism, or ``uncertain`` without any.
 
@@ -123,11 +126,13 @@ class ContinuousPoseOutput:
             errors, (N, 6, 6) or larger; None without a trajectory.
         converged
             (N,) whether the trajectory is reliable there; no other pose is valid. Default: everywhere.
+        ambiguous
+            (N,) whether the state was ambiguous shortly before, which degrades a pose. Default: nowhere.
         """
         batch = PoseBatch.blank(stamp_ns, self._prisms, Kind.SMOOTHED)
         for column in range(len(self._prisms)):
             self._describe(batch, column, history)
-        return self._with_poses(batch, states, covariance, converged=converged)
+        return self._with_poses(batch, states, covariance, converged=converged, ambiguous=ambiguous)
 
     def _latest(
         self, prism: PrismHistory, home_station: int, epoch_ns: int
@@ -184,6 +189,7 @@ class ContinuousPoseOutput:
         covariance: NDArray[np.float64],
         *,
         converged: NDArray[np.bool_] | None = None,
+        ambiguous: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
         """Fill in the poses that are known, and the reasons of invalid ones."""
         missing = batch.prism_reason.max(axis=1)
@@ -191,8 +197,6 @@ class ContinuousPoseOutput:
             batch.reason[:] = np.where(missing, missing, Reason.DEGENERATE_GEOMETRY)
             return poses_at(batch, self._reference_point)
         limits, rotation = self._limits, states.rotation
-        variance_m2 = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1]
-        sigma_m = np.sqrt(np.where(variance_m2 >= 0, variance_m2, np.nan))
         states, covariance = state_at_point(states, covariance, self._to_origin_m)
         covariance, sigma_rad = with_second_order_terms(rotation, covariance)
         unknown = ~(sigma_rad < MAX_ROTATION_SIGMA_RAD)
@@ -210,13 +214,17 @@ class ContinuousPoseOutput:
                 numbers[unknown] = np.nan
             for numbers in (batch.velocity_mps, batch.angular_velocity_radps, batch.residual_m):
                 numbers[unknown] = np.nan
+        batch = poses_at(batch, self._reference_point)
+        sigmas = np.column_stack([worst_sigma(batch.covariance[:, :3, :3]), sigma_rad])
         # Rounding may make a variance negative; its sigma is NaN, which is below no limit.
-        uncertain = unknown | ~(sigma_m <= limits.position_sigma_limit_m)
-        uncertain |= sigma_rad > limits.rotation_sigma_limit_rad
+        uncertain = unknown | ~(sigmas <= sigma_limits(batch.kind, limits)).all(axis=1)
         batch.reason[rotation[:, 2, 2] <= math.cos(limits.tilt_limit_rad)] = Reason.TILT
         batch.reason[batch.residual_m > limits.residual_limit_m] = Reason.RESIDUAL
         if converged is not None:
             batch.reason[~converged & (batch.reason == Reason.VALID)] = Reason.UNCERTAIN
         if uncertain.any():
-            batch.reason[uncertain] = np.where(missing, missing, Reason.UNCERTAIN)[uncertain]
-        return poses_at(batch, self._reference_point)
+            # A wrong layout makes poses uncertain too: its outliers have little weight.
+            present = np.where(batch.reason == Reason.RESIDUAL, Reason.RESIDUAL, Reason.UNCERTAIN)
+            batch.reason[uncertain] = np.where(missing, missing, present)[uncertain]
+        batch.degraded[:] = degradations(batch, sigmas, limits, ambiguous=ambiguous)
+        return batch

@@ -38,6 +38,7 @@ from tsgt.recording import (
     PoseRecord,
     RecordingHeader,
     RecordingWriter,
+    ValidityLimits,
     encode_line,
     new_recording_path,
 )
@@ -88,7 +89,7 @@ async def run_master(
     path = new_recording_path(config.recording.directory, "master", start_ns)
     server = StreamServer(
         config.stream.socket,
-        encode_line(HelloRecord()),
+        encode_line(HelloRecord(limits=ValidityLimits.of(parameters))),
         mode=int(config.stream.mode, 8),
         queue_lines=config.stream.queue_lines,
         unix_now_ns=lambda: timeline.unix_ns(clock.monotonic_ns()),

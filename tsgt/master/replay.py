@@ -12,7 +12,9 @@ from tsgt.recording import (
     BeaconRecord,
     ClockRecord,
     EventRecord,
+    HelloRecord,
     StatusRecord,
+    ValidityLimits,
     decode_line,
     encode_line,
     read_lines,
@@ -79,6 +81,14 @@ def replayed(
                 raise
             if on_problem is not None:
                 on_problem(problem)
+
+
+def greeting(path: Path, *, keep_going: bool = False) -> HelloRecord:
+    """Return the greeting of a replay: with the limits of the recording's first session. Raises as :func:`replayed`."""
+    for line in read_lines(path, keep_going=keep_going):
+        if line.type == "parameters":
+            return HelloRecord(limits=ValidityLimits.of(decode_line(Parameters, line, path)))
+    return HelloRecord()
 
 
 def _arrival(

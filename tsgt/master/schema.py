@@ -27,6 +27,7 @@ SCHEMA = Path("configs/schema/stream.schema.json")
 PAGES: dict[Path, tuple[type, ...]] = {
     Path("docs/reference/stream.md"): (
         recording.HelloRecord,
+        recording.ValidityLimits,
         model.PolarMeasurement,
         model.PointMeasurement,
         recording.PoseRecord,

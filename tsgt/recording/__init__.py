@@ -23,6 +23,7 @@ from tsgt.recording.stream_records import (
     PROTOCOL_VERSION,
     BeaconRecord,
     ClockRecord,
+    Degradation,
     EventRecord,
     HelloRecord,
     Kind,
@@ -30,6 +31,7 @@ from tsgt.recording.stream_records import (
     StationShare,
     StationStatus,
     StatusRecord,
+    ValidityLimits,
 )
 from tsgt.recording.writer import RecordingWriter
 
@@ -39,6 +41,7 @@ __all__ = [
     "PROTOCOL_VERSION",
     "BeaconRecord",
     "ClockRecord",
+    "Degradation",
     "EventRecord",
     "HelloRecord",
     "Kind",
@@ -52,6 +55,7 @@ __all__ = [
     "StationStatus",
     "StatusRecord",
     "Typed",
+    "ValidityLimits",
     "decode",
     "decode_line",
     "encode_line",

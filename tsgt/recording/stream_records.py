@@ -17,6 +17,7 @@ from tsgt.model import (
     WORLD_FRAME,
     ClockSample,
     FiniteNumbers,
+    Parameters,
     Row4,
     Status,
     Vector3,
@@ -29,11 +30,65 @@ CAPABILITIES = ("measurement", "point", "pose", "clock", "beacon", "status", "ev
 
 Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]
+Quality = Literal["good", "degraded", "invalid"]
+Degradation = Literal["prism_missing", "old_measurements", "uncertain", "ambiguous", "residual"]
+
+CONTINUOUS_PROMISE = (
+    "The sigmas that the pose states, of position at the reference point and of rotation, each in its least certain "
+    "direction, are within the limits of its kind, and no measurement contradicts it."
+)
+LINEAR_PROMISE = (
+    "Every prism was measured before and after the pose within the outage limit, and their positions fit."
+)
 
 # Aliases, because pydantic evaluates annotations at run time.
 PositionOrNone = Vector3 | None
 QuaternionOrNone = Row4 | None
 CovarianceOrNone = Annotated[tuple[float, ...], Field(min_length=36, max_length=36)] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValidityLimits(FiniteNumbers):
+    """What ``valid`` promises of a pose, and the limits that are set in the configuration."""
+
+    promise: str
+    """The promise in one sentence."""
+    reference_point: str
+    """Name of the point whose position is judged: ``child_frame`` of the poses."""
+    position_sigma_m: float | None
+    """Limit of the position's sigma in its least certain direction, in m; null: none, with the estimator linear."""
+    rotation_sigma_rad: float | None
+    """The same for the rotation, in rad."""
+    predicted_position_sigma_m: float | None
+    """Limit of the position's sigma of predicted poses, in m; null: none are sent."""
+    predicted_rotation_sigma_rad: float | None
+    """The same for the rotation, in rad."""
+    residual_m: float
+    """Limit of ``residual_m`` of the pose, in m."""
+    tilt_rad: float
+    """Limit of the angle between the robot's z axis and the vertical, in rad."""
+    outage_s: float
+    """A prism without measurements for longer, in s, is missing: poses of the estimator linear are then invalid."""
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> ValidityLimits:
+        """Return the limits of the parameters in force."""
+        limits = parameters.pipeline
+        continuous = limits.estimator == "continuous"
+        return cls(
+            promise=CONTINUOUS_PROMISE if continuous else LINEAR_PROMISE,
+            reference_point=parameters.reference_point.name,
+            position_sigma_m=limits.position_sigma_limit_m if continuous else None,
+            rotation_sigma_rad=limits.rotation_sigma_limit_rad if continuous else None,
+            predicted_position_sigma_m=limits.predicted_position_sigma_limit_m if continuous else None,
+            predicted_rotation_sigma_rad=limits.predicted_rotation_sigma_limit_rad if continuous else None,
+            residual_m=limits.residual_limit_m,
+            tilt_rad=limits.tilt_limit_rad,
+            outage_s=limits.outage_limit_ns / 1e9,
+        )
+
+
+LimitsOrNone = ValidityLimits | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +103,8 @@ class HelloRecord:
     """Version of the software that serves the stream."""
     capabilities: tuple[str, ...] = CAPABILITIES
     """Types of lines that may follow."""
+    limits: LimitsOrNone = None
+    """What ``valid`` promises of a pose, with the limits in force; null where no poses follow."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +163,14 @@ class PoseRecord(FiniteNumbers):
     reported an error), ``degenerate_geometry`` (prisms collinear or coincident), ``residual`` (the prisms miss their
     layout by too much), ``uncertain`` (all prisms are measured, but the pose is not known well enough), ``tilt`` (the
     robot would lean too far: mirrored layout or swapped prisms). Empty when valid."""
+    quality: Quality | None = None
+    """``good``; ``degraded``: valid, but with less reserve, see ``degraded_by``; ``invalid``: not ``valid``. Null in
+    recordings of older versions."""
+    degraded_by: tuple[Degradation, ...] = ()
+    """What degrades a valid pose: ``prism_missing`` (fewer than three prisms are measured), ``old_measurements`` (a
+    prediction whose newest measurement is older than three quarters of the outage limit), ``uncertain`` (a sigma is
+    above half its limit), ``ambiguous`` (measurements contradicted each other up to 1.5 s before), ``residual``
+    (``residual_m`` is above half its limit)."""
     residual_m: float | None
     """Root mean square over the prisms of their distance in m from the fitted layout; null without a fit."""
     stations: tuple[StationShare, ...]

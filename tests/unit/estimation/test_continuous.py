@@ -12,7 +12,7 @@ from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import Kind, PoseBatch, Reason
 from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
-from tsgt.model import PolarMeasurement, PrismPosition, Status
+from tsgt.model import PolarMeasurement, PrismPosition, ReferencePoint, Status
 
 PERIOD = 50_000_000
 LAG = 3 * SECOND
@@ -226,12 +226,31 @@ def test_predictions_end_without_measurements(scene: Scene) -> None:
     assert smoothed.reason[-1] == Reason.OUTAGE
 
 
-def test_tight_limit_makes_poses_uncertain(scene: Scene) -> None:
-    """With all prisms measured."""
-    tight = scene.with_limits(position_sigma_limit_m=0.005)
-    predicted, smoothed = stream(tight, every(tight, 8.0), 8.0)
+@pytest.mark.parametrize("name", ["position_sigma_limit_m", "rotation_sigma_limit_rad"])
+def test_tight_limit_makes_poses_uncertain(scene: Scene, name: str) -> None:
+    """With all prisms measured; predicted poses have limits of their own."""
+    measurements = every(scene, 8.0)
+    predicted, smoothed = stream(scene.with_limits(**{f"predicted_{name}": 0.001}), measurements, 8.0)
     assert Reason.UNCERTAIN in predicted.reason[-8:]
     assert smoothed.valid[-20:].all()
+    predicted, smoothed = stream(scene.with_limits(**{name: 0.001}), measurements, 8.0)
+    assert predicted.valid[-8:].all()
+    assert Reason.UNCERTAIN in smoothed.reason[-8:]
+
+
+def test_position_limit_is_judged_at_the_reference_point(scene: Scene) -> None:
+    """The uncertain rotation swings a point on a long lever arm about."""
+    far = replace(
+        scene,
+        parameters=replace(
+            scene.parameters, reference_point=ReferencePoint(name="mast", position_m=(0.0, 0.0, 60.0))
+        ),
+    )
+    near, _ = stream(scene, every(scene, 8.0), 8.0)
+    predicted, smoothed = stream(far, every(scene, 8.0), 8.0)
+    assert near.valid[-8:].all()
+    assert not predicted.valid.any()
+    assert set(smoothed.reason[-20:].tolist()) == {Reason.UNCERTAIN}
 
 
 def test_wrong_layout_is_the_reason(scene: Scene) -> None:

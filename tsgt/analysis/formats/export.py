@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tsgt.recording import PoseRecord
 
 POSE_COLUMNS = (
-    *("stamp_ns", "valid", "reason", "estimator", "kind"),
+    *("stamp_ns", "valid", "reason", "quality", "degraded_by", "estimator", "kind"),
     *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"),
     *("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"),
@@ -67,7 +67,8 @@ def pose_csv(poses: Iterable[PoseRecord]) -> Iterator[str]:
         )
         yield line(
             (
-                *(pose.stamp_ns, int(pose.valid), pose.reason, pose.estimator, pose.kind),
+                *(pose.stamp_ns, int(pose.valid), pose.reason, pose.quality, " ".join(pose.degraded_by)),
+                *(pose.estimator, pose.kind),
                 *(pose.position_m or [None] * 3),
                 *(pose.orientation_xyzw or [None] * 4),
                 *sigmas,

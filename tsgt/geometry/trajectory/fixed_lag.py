@@ -32,7 +32,7 @@ from tsgt.geometry.trajectory.gauss_newton import (
     solve,
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
-from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
+from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
 from tsgt.geometry.trajectory.measurement_factors import Observations
 from tsgt.geometry.trajectory.propagation import Propagator, acceleration_response
 from tsgt.geometry.trajectory.query import Trajectory
@@ -144,6 +144,10 @@ class FixedLagSmoother:
     def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """Whether the state stays ambiguous at times (N,); see :class:`InnovationMonitor`."""
         return self._monitor.ambiguous_at(time_s)
+
+    def recently_ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Whether the state was ambiguous up to :data:`AMBIGUITY_MARGIN_S` before times (N,)."""
+        return self._monitor.ambiguous_at(time_s, margin_s=AMBIGUITY_MARGIN_S)
 
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""

@@ -33,15 +33,15 @@ class InnovationMonitor:
         """Start of the current ambiguity, infinite while the innovations are consistent."""
         return self._inconsistent_from_s - AMBIGUITY_MARGIN_S if self.inconsistent_prisms else np.inf
 
-    def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether the state stays ambiguous at times (N,), by the resolved ambiguities.
+    def ambiguous_at(self, time_s: FloatArray, *, margin_s: float = 0.0) -> NDArray[np.bool_]:
+        """Whether the state stays ambiguous at times (N,), by the resolved ambiguities, or did shortly before.
 
         None remains if all flagged measurements are of one prism and still outliers: then these were wrong. Otherwise the
         trajectory followed the wrong ones, or was bent towards all of them.
         """
         found = np.zeros(len(time_s), np.bool_)
         for from_s, until_s in self._ambiguous_intervals_s:
-            found |= (time_s >= from_s) & (time_s <= until_s)
+            found |= (time_s >= from_s) & (time_s <= until_s + margin_s)
         return found
 
     def reset(self, observations: Observations) -> None:
@@ -58,8 +58,10 @@ class InnovationMonitor:
         self._flagged = self._flagged[rows]
 
     def discard_before(self, before_s: float) -> None:
-        """Drop ambiguous intervals that end before a time."""
-        self._ambiguous_intervals_s = [each for each in self._ambiguous_intervals_s if each[1] >= before_s]
+        """Drop ambiguous intervals that ended long before a time."""
+        self._ambiguous_intervals_s = [
+            each for each in self._ambiguous_intervals_s if each[1] + AMBIGUITY_MARGIN_S >= before_s
+        ]
 
     def update(
         self,

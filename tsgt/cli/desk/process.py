@@ -113,7 +113,7 @@ def process(
         "seconds": time.perf_counter() - started_s,
         "duration_s": duration_s(poses),
         "measurements": len(loaded.measurements),
-        **({} if continuous is None else motion_keys(continuous)),
+        **({} if continuous is None else {**motion_keys(continuous), "rest_s": continuous.fit.rest_s}),
     }
     if as_json:
         print_json(result)
@@ -121,6 +121,7 @@ def process(
     click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements")
     if continuous is not None:
         click.echo(motion_text(continuous.motion))
+        click.echo(f"At rest: {continuous.fit.rest_s:.1f} s in {len(continuous.fit.rest)} intervals")
 
 
 def _processed(loaded: Recording, path: Path) -> tuple[PoseBatch, Parameters, SmoothedRecording | None]:

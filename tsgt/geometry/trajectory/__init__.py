@@ -18,6 +18,8 @@ from tsgt.geometry.trajectory.initialisation import initial_guess
 from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations, linearise
 from tsgt.geometry.trajectory.noise_scales import overall_scale, scale_noise
 from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
+from tsgt.geometry.trajectory.rest import RestInterval, in_rest
+from tsgt.geometry.trajectory.rest_detection import Series, find_rest, find_rest_in_series
 from tsgt.geometry.trajectory.states import STATE_DIM, States, concatenate_states
 
 __all__ = [
@@ -27,12 +29,17 @@ __all__ = [
     "FixedLagSmoother",
     "LinearisedMeasurements",
     "Observations",
+    "RestInterval",
+    "Series",
     "Solution",
     "States",
     "Trajectory",
     "TrajectoryFit",
     "concatenate_states",
+    "find_rest",
+    "find_rest_in_series",
     "fit_trajectory",
+    "in_rest",
     "initial_guess",
     "knot_times",
     "linearise",

@@ -24,11 +24,13 @@ from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.noise_scales import scale_noise
 from tsgt.geometry.trajectory.query import Trajectory
+from tsgt.geometry.trajectory.rest import RestInterval, rest_factors, with_vibration
+from tsgt.geometry.trajectory.rest_detection import find_rest
 from tsgt.geometry.trajectory.states import concatenate_states
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
@@ -48,11 +50,17 @@ class TrajectoryFit:
     residuals_m: FloatArray
     squared_distances: FloatArray  # (M,) squared Mahalanobis distances of the residuals
     weights: FloatArray  # (M,) of the robust loss: 1, or less for an outlier
+    rest: tuple[RestInterval, ...]  # Intervals in which the robot was taken to stand still
 
     @property
     def prior(self) -> MotionPrior:
         """Motion prior."""
         return self.trajectory.prior
+
+    @property
+    def rest_s(self) -> float:
+        """Total duration of rest."""
+        return sum(each.end_s - each.start_s for each in self.rest)
 
 
 class _Segment(NamedTuple):
@@ -68,6 +76,7 @@ def fit_trajectory(
     prior: MotionPrior | None = None,
     occluded_prior: MotionPrior | None = None,
     noise_scale: FloatArray | float | None = None,
+    rest: Sequence[RestInterval] | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> TrajectoryFit:
     """Fit a trajectory.
@@ -80,6 +89,7 @@ def fit_trajectory(
     prior : Tuned on the measurements when not given.
     occluded_prior : Process-noise floor while fewer than three prisms are observed; ``prior`` when only that is given.
     noise_scale : Factor on the stated noise, or factors by station and component, (S, 3); tuned when not given.
+    rest : Intervals in which the robot stands still; found in the measurements when not given.
     on_progress : Called with the completed share of the work, 0 to 1.
     """
     report_progress = on_progress or (lambda _: None)
@@ -90,10 +100,12 @@ def fit_trajectory(
             prior = with_noise_floor(tuned.prior, MotionPrior(), NOISE_FLOOR_SHARE)
             occluded_prior = occluded_prior or MotionPrior()
     scales = np.ones((len(observations.frames), 3)) * noise_scale
-    observations = scale_noise(observations, scales)
+    rest = tuple(find_rest(observations) if rest is None else rest)
+    observations = with_vibration(scale_noise(observations, scales), rest, observations.sigmas_m)
     times_s = knot_times(observations.time_s)
     knot_index = nearest_knots(times_s, observations.time_s)
     sigmas = _sigmas(observations, times_s, prior, occluded_prior or prior)
+    sigmas, at_rest = rest_factors(rest, times_s, sigmas, observations.layout)
     segments = _segments(len(times_s))
     tracks = PrismTracks.of(observations)
     knots, covariances, cross_covariances, residuals_m, squared_distances, weights = [], [], [], [], [], []
@@ -102,7 +114,13 @@ def fit_trajectory(
         rows = slice(*np.searchsorted(knot_index, (segment.solved.start, segment.solved.stop)))
         guess = tracks.guess(times_s[segment.solved])
         steps = slice(segment.solved.start, segment.solved.stop - 1)
-        solution = solve(observations.select(rows), guess, prior, sigmas=sigmas[steps])
+        solution = solve(
+            observations.select(rows),
+            guess,
+            prior,
+            sigmas=sigmas[steps],
+            rest=None if at_rest is None else at_rest[steps],
+        )
         covariance, cross_covariance = solution.factor.marginals()
         kept_knots = slice(
             segment.kept.start - segment.solved.start, segment.kept.stop - segment.solved.start
@@ -130,6 +148,7 @@ def fit_trajectory(
         np.concatenate(residuals_m),
         np.concatenate(squared_distances),
         np.concatenate(weights),
+        rest,
     )
 
 

@@ -143,6 +143,7 @@ def solve(
     *,
     anchor: AnchorPrior | None = None,
     sigmas: FloatArray | None = None,
+    rest: FloatArray | None = None,
     max_iterations: int = MAX_ITERATIONS,
     reject_outliers: bool = True,
 ) -> Solution:
@@ -150,12 +151,12 @@ def solve(
 
     ``guess``: states at the knot times of the result; rotations within about a radian of the solution. ``anchor``: prior on
     the first knot; diffuse when not given. ``sigmas``: (K - 1, 6) acceleration sigmas of each step instead of those of
-    ``prior``. ``reject_outliers``: solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`; without, the
+    ``prior``; ``rest``: of :class:`ProcessFactors`. ``reject_outliers``: solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`; without, the
     solution is a smooth function of its inputs. Raises GeometryError: the measurements do not determine the trajectory.
     """
     anchor = diffuse_prior(guess.select(slice(0, 1)), prior) if anchor is None else anchor
     knot_index = nearest_knots(guess.time_s, observations.time_s)
-    process = ProcessFactors.of(guess.time_s, prior, sigmas)
+    process = ProcessFactors.of(guess.time_s, prior, sigmas, rest)
     found = _minimise(observations, knot_index, guess, process, anchor, max_iterations)
     if not reject_outliers or not (found.squared_distances > REJECTION_THRESHOLD**2).any():
         return found

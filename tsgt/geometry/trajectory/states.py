@@ -90,9 +90,17 @@ class ProcessFactors:
 
     phi: FloatArray  # (K - 1, 6, 3, 3) transition matrix of each axis
     information: FloatArray  # (K - 1, 6, 3, 3) inverse of the process noise covariance
+    # (K - 1, 6) information about the velocity, which is zero at rest, at either end of the step; None: nowhere at rest
+    rest: FloatArray | None = None
 
     @classmethod
-    def of(cls, time_s: FloatArray, prior: MotionPrior, sigmas: FloatArray | None = None) -> ProcessFactors:
+    def of(
+        cls,
+        time_s: FloatArray,
+        prior: MotionPrior,
+        sigmas: FloatArray | None = None,
+        rest: FloatArray | None = None,
+    ) -> ProcessFactors:
         """Make the factors between knots; ``sigmas``, (K - 1, 6), override the prior's acceleration sigmas."""
         dt_s = (time_s[1:] - time_s[:-1])[:, None]
         times_s = np.array(
@@ -101,12 +109,16 @@ class ProcessFactors:
         two_phi, two_information = transition(dt_s, times_s), process_information(dt_s, times_s)
         weights = (axis_sigmas(prior)[None] if sigmas is None else sigmas) ** -2.0
         return cls(
-            np.repeat(two_phi, 3, axis=1), np.repeat(two_information, 3, axis=1) * weights[:, :, None, None]
+            np.repeat(two_phi, 3, axis=1),
+            np.repeat(two_information, 3, axis=1) * weights[:, :, None, None],
+            rest,
         )
 
     def select(self, rows: slice) -> ProcessFactors:
         """Return the factors of some steps."""
-        return ProcessFactors(self.phi[rows], self.information[rows])
+        return ProcessFactors(
+            self.phi[rows], self.information[rows], None if self.rest is None else self.rest[rows]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +209,14 @@ def add_process_factors(
         matrix.reshape(count, 3, 2, 3, 3, 2, 3)[:, :, 1, :, :, 1] += block.reshape(count, 3, 3, 3, 3)
     gradient_by_kind[:-1, :, 1] += normal[:, :9, 18].reshape(count, 3, 3)
     gradient_by_kind[1:, :, 1] += normal[:, 9:18, 18].reshape(count, 3, 3)
-    return cost + float(normal[:, 18, 18].sum())
+    cost += float(normal[:, 18, 18].sum())
+    if factors.rest is not None:
+        velocities = slice(6, 12)
+        for end, axes in ((slice(None, -1), linearised.earlier), (slice(1, None), linearised.later)):
+            np.einsum("nii->ni", diagonal[end, velocities, velocities])[...] += factors.rest
+            gradient[end, velocities] += factors.rest * axes[:, :, 1]
+            cost += float((factors.rest * axes[:, :, 1] ** 2).sum())
+    return cost
 
 
 def _translation_blocks(matrix: FloatArray) -> FloatArray:

@@ -95,6 +95,7 @@ def test_tuned_motion_prior_is_recorded(tsgt: Tsgt, recording: Path) -> None:
     assert {pose["kind"] for pose in poses} == {"smoothed"}
     assert result["estimator"] == parameters["pipeline"]["estimator"] == "continuous"
     assert result["motion_tuned"] is True
+    assert result["rest_s"] == 0.0
     assert parameters["pipeline"]["motion"] == result["motion"]
     assert parameters["pipeline"]["noise_scale"] == result["noise_scale"]
     station, factors = parameters["stations"][0], result["noise_scales"]["1"]

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from tsgt.analysis.evaluation import Reference, read_tum
 from tsgt.analysis.formats import tum_lines
 from tsgt.errors import InputFileError
+from tsgt.model import ROBOT_ORIGIN
 
 stamps = st.lists(st.integers(0, 2**63 - 1), min_size=2, max_size=20, unique=True).map(sorted)
 metres = st.floats(-1e5, 1e5)
@@ -36,7 +37,9 @@ def test_exported_trajectory_round_trips(stamps_ns: list[int], data: st.DataObje
     positions = np.array([position for position, _ in rows])
     turns = np.array([turn for _, turn in rows])
     turns /= np.linalg.norm(turns, axis=1)[:, None]
-    found = read("".join(tum_lines(zip(stamps_ns, positions.tolist(), turns.tolist(), strict=True))))
+    found = read(
+        "".join(tum_lines(zip(stamps_ns, positions.tolist(), turns.tolist(), strict=True), ROBOT_ORIGIN))
+    )
     assert found.stamp_ns.tolist() == stamps_ns
     np.testing.assert_allclose(found.position_m, positions, rtol=0, atol=0.51e-9)
     np.testing.assert_allclose(found.orientation_xyzw, turns, rtol=0, atol=2e-12)

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import measurement_csv, messages, pose_csv, tum_lines, valid_records, write_mcap
 from tsgt.analysis.processing import process
-from tsgt.cli.options import keep_going_option, path_type, recording_argument, unknown_suffix
+from tsgt.cli.options import (
+    keep_going_option,
+    path_type,
+    point_option,
+    recording_argument,
+    reference_point_option,
+    unknown_suffix,
+)
 from tsgt.cli.output import refuse_overwrite, report_problem, require_extra
 from tsgt.cli.progress import TUNING, progress
-from tsgt.cli.recordings import load, write_lines
+from tsgt.cli.recordings import load, load_reference, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
+from tsgt.estimation import records_at
+from tsgt.model import ROBOT_ORIGIN, Parameters
 from tsgt.recording import PoseRecord, decode_line, read_lines, write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from tsgt.model import ReferencePoint
     from tsgt.recording import Kind, Recording
 
 STDOUT = Path("-")
@@ -53,7 +63,7 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
     "--reference",
     "reference_path",
     type=path_type,
-    help="Reference trajectory to add to an MCAP file: TUM, of the robot frame in the frame of station 1.",
+    help="Reference trajectory to add to an MCAP file: TUM, in the frame of station 1.",
 )
 @click.option(
     "--output",
@@ -62,6 +72,8 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
     show_default=False,
     help="File to write: .tum, .csv or .mcap.  [default: stdout, except for MCAP]",
 )
+@point_option
+@reference_point_option
 @keep_going_option
 def export(
     *,
@@ -71,6 +83,8 @@ def export(
     kind: Kind | None,
     reference_path: Path | None,
     output: Path,
+    point: ReferencePoint | None,
+    reference_point: ReferencePoint | None,
     keep_going: bool,
 ) -> None:
     """Convert a recording to TUM, CSV or MCAP.
@@ -97,10 +111,11 @@ def export(
         require_extra("MCAP files", "mcap.writer", "rosbags.typesys", extra="mcap")
     if output != STDOUT:
         refuse_overwrite([recording, reference_path], output)
+    point = point or _first_reference_point(recording)
     if format_name == "mcap":
-        reference = None if reference_path is None else read_tum(reference_path)
-        loaded = load(recording, keep_going=keep_going)
-        poses = _poses_of(recording, kind, keep_going=keep_going, loaded=loaded)
+        reference = load_reference(reference_path, reference_point)
+        loaded = load(recording, keep_going=keep_going, point=point)
+        poses = _poses_of(recording, kind, point, keep_going=keep_going, loaded=loaded)
         with write_atomically(output) as file:
             write_mcap(file, messages(loaded, poses, reference))
         return
@@ -108,27 +123,43 @@ def export(
     if records == "measurements":
         lines = measurement_csv(load(recording, keep_going=keep_going).measurements)
     else:
-        poses = _poses_of(recording, kind, keep_going=keep_going, quiet=output == STDOUT)
-        lines = pose_csv(poses) if format_name == "csv" else tum_lines(valid_records(poses))
+        poses = _poses_of(recording, kind, point, keep_going=keep_going, quiet=output == STDOUT)
+        lines = pose_csv(poses) if format_name == "csv" else tum_lines(valid_records(poses), point)
     if output == STDOUT:
         sys.stdout.writelines(lines)
     else:
         write_lines(output, lines)
 
 
+def _first_reference_point(path: Path) -> ReferencePoint:
+    """Return the reference point of a recording's first session; the later ones are carried over to it."""
+    for line in read_lines(path, keep_going=True):
+        if line.type == "parameters":
+            with suppress(CorruptLineError):  # reported, or skipped, when the poses are read
+                return decode_line(Parameters, line, path).reference_point
+    return ROBOT_ORIGIN
+
+
 def _poses_of(
-    path: Path, kind: Kind | None, *, keep_going: bool, quiet: bool = False, loaded: Recording | None = None
+    path: Path,
+    kind: Kind | None,
+    point: ReferencePoint,
+    *,
+    keep_going: bool,
+    quiet: bool = False,
+    loaded: Recording | None = None,
 ) -> Iterator[PoseRecord]:
-    """Yield the poses of a recording; if it has none, compute them.
+    """Yield the poses of a recording, carried over to a point; if it has none, compute them.
 
     ``quiet`` suppresses the progress bar, which would mix with lines on the terminal. Problems of a recording that is
     ``loaded`` have been reported already.
     """
     found = False
-    for pose in _recorded_poses(path, keep_going=keep_going, quiet=quiet, reported=loaded is not None):
-        if pose.kind != "predicted" if kind is None else pose.kind == kind:
-            found = True
-            yield pose
+    recorded = _recorded_poses(path, kind, keep_going=keep_going, quiet=quiet, reported=loaded is not None)
+    for own_point, poses in itertools.groupby(recorded, key=lambda pair: pair[0]):
+        found = True
+        of_point = (pose for _, pose in poses)
+        yield from of_point if own_point == point else records_at(of_point, own_point, point)
     if found:
         return
     if kind is not None:
@@ -137,11 +168,16 @@ def _poses_of(
         )
     click.echo(f"{path} holds no poses; processing its measurements", err=True)
     with progress("fitting", first=TUNING) as on_progress:
-        batch = process(loaded or load(path, keep_going=keep_going), path=path, on_progress=on_progress)
+        loaded = loaded or load(path, keep_going=keep_going, point=point)
+        batch = process(loaded, path=path, on_progress=on_progress)
     yield from batch.records()
 
 
-def _recorded_poses(path: Path, *, keep_going: bool, quiet: bool, reported: bool) -> Iterator[PoseRecord]:
+def _recorded_poses(
+    path: Path, kind: Kind | None, *, keep_going: bool, quiet: bool, reported: bool
+) -> Iterator[tuple[ReferencePoint, PoseRecord]]:
+    """Yield the poses of a kind (default: all but predicted), each with its point."""
+    point = ROBOT_ORIGIN
     on_problem = None if reported else report_problem
     done_bytes = 0
     with nullcontext() if quiet else progress("exporting") as on_progress:
@@ -149,15 +185,19 @@ def _recorded_poses(path: Path, *, keep_going: bool, quiet: bool, reported: bool
             done_bytes += len(line.data) + 1
             if on_progress is not None and line.number % 1000 == 0:
                 on_progress(done_bytes / path.stat().st_size)
-            if line.type != "pose":
+            if line.type not in ("pose", "parameters"):
                 continue
             try:
+                if line.type == "parameters":
+                    point = decode_line(Parameters, line, path).reference_point
+                    continue
                 pose = decode_line(PoseRecord, line, path)
             except CorruptLineError as problem:
                 if not keep_going:
                     raise
                 report_problem(problem)
             else:
-                yield pose
+                if pose.kind != "predicted" if kind is None else pose.kind == kind:
+                    yield point, pose
         if on_progress is not None:
             on_progress(1.0)

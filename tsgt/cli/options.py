@@ -99,6 +99,51 @@ def constant_m(
     return (given_mm or 0.0) / 1e3
 
 
+class PointType(click.ParamType[Any]):
+    """A point of the robot: X,Y,Z in m, perhaps with a name and a rotation."""
+
+    name = "point"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse the text; an impossible point is a usage error."""
+        from tsgt.estimation import parse_reference_point
+
+        if not isinstance(value, str):
+            return value
+        try:
+            return parse_reference_point(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+
+POINT_METAVAR = "[NAME=]X,Y,Z[,QX,QY,QZ,QW]"
+
+point_option = click.option(
+    "--point",
+    type=PointType(),
+    metavar=POINT_METAVAR,
+    help="Point of the robot whose poses are given: position in m and quaternion in the robot frame.  "
+    "[default: as recorded, else the robot's origin]",
+)
+
+POINT_METAVAR = "[NAME=]X,Y,Z[,QX,QY,QZ,QW]"
+
+point_option = click.option(
+    "--point",
+    type=PointType(),
+    metavar=POINT_METAVAR,
+    help="Point of the robot whose poses are given: position in m and quaternion in the robot frame.  "
+    "[default: as recorded, else the robot's origin]",
+)
+
+reference_point_option = click.option(
+    "--reference-point",
+    type=PointType(),
+    metavar=POINT_METAVAR,
+    help="Point of the robot that the reference trajectory is of.  "
+    "[default: as its file states, else the robot's origin]",
+)
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 
 socket_option = click.option(

@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 import tsgt
-from tsgt.analysis.evaluation import noise_scales_by_axis
+from tsgt.analysis.evaluation import noise_scales_by_axis, read_tum
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.setup_replacement import with_calibration, with_layout
 from tsgt.cli.options import path_type
@@ -23,10 +23,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
+    from tsgt.analysis.evaluation import Reference
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import MotionModel, SmoothedRecording
     from tsgt.estimation import PoseBatch
-    from tsgt.model import Parameters
+    from tsgt.model import Parameters, ReferencePoint
     from tsgt.recording import Recording
 
 estimator_option = click.option(
@@ -66,6 +67,7 @@ def load(
     rate_hz: float | None = None,
     frames: Path | None = None,
     prisms: Path | None = None,
+    point: ReferencePoint | None = None,
 ) -> Recording:
     """Read a recording and replace the parameters that are given."""
     recording = load_recording(path, keep_going=keep_going, on_problem=report_problem)
@@ -81,8 +83,18 @@ def load(
         parameters = with_calibration(parameters, load_station_calibration(frames), path=frames)
     if prisms is not None:
         parameters = with_layout(parameters, load_prism_layout(prisms), path=prisms)
+    if point is not None:
+        parameters = dataclasses.replace(parameters, reference_point=point)
     recording = dataclasses.replace(recording, parameters=parameters)
     return recording if estimator is None else with_estimator(recording, estimator)
+
+
+def load_reference(path: Path | None, point: ReferencePoint | None) -> Reference | None:
+    """Read a reference trajectory, of the point that is given or else of that which the file states."""
+    if path is None:
+        return None
+    reference = read_tum(path)
+    return reference if point is None else dataclasses.replace(reference, reference_point=point)
 
 
 def pose_counts(poses: PoseBatch) -> dict[str, Any]:

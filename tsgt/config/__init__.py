@@ -42,7 +42,7 @@ from tsgt.config.master import (
 )
 from tsgt.config.parameters import level_frame, noise, parameters, scenario_parameters
 from tsgt.config.permissions import check_permissions
-from tsgt.config.pipeline import PipelineConfig
+from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import (
     MAX_STATION_NUMBERS,
     ClassicConfig,
@@ -96,6 +96,7 @@ __all__ = [
     "ProtocolConfig",
     "RadioConfig",
     "RecordingConfig",
+    "ReferencePointConfig",
     "ScenarioConfig",
     "ScenarioRadioConfig",
     "SetupConfig",

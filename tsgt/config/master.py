@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, unique_by
-from tsgt.config.pipeline import PipelineConfig
+from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import MasterProtocolConfig, RadioConfig, check_numbers
 from tsgt.polygon import check_simple
 
@@ -92,7 +92,7 @@ class GeofenceConfig(Model):
     polygon_m: Annotated[tuple[Corner, ...], Field(min_length=3), AfterValidator(_simple)]
     """Corners [x, y] in order; the last is joined to the first."""
     margin_m: Annotated[float, Field(ge=0, le=1e4)] = 0.0
-    """Minimum distance of the robot's origin from the boundary on the allowed side, for example half its length."""
+    """Minimum distance of the reference point from the boundary on the allowed side, for example half the robot's length."""
     sigmas: Annotated[float, Field(ge=0, le=10)] = 3.0
     """Position uncertainty added to the margin, in standard deviations."""
     hysteresis_m: Annotated[float, Field(ge=0, le=1e4)] = 0.5
@@ -118,6 +118,8 @@ class MasterConfig(Model):
     """Radio protocol; as the clients'."""
     pipeline: PipelineConfig = PipelineConfig()
     """Estimator and limits."""
+    reference_point: ReferencePointConfig = ReferencePointConfig()
+    """Reference point of the poses: the robot frame by default."""
     frame_watch: FrameWatchConfig = FrameWatchConfig()
     """Layout monitor."""
     geofences: Annotated[tuple[GeofenceConfig, ...], unique_by("name")] = ()

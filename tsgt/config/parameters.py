@@ -73,6 +73,7 @@ def parameters(config: MasterConfig) -> Parameters:
         ),
         prisms=tuple(PrismPosition(prism=prism, position_m=layout[prism]) for prism in tracked),
         pipeline=pipeline_parameters(config.pipeline),
+        reference_point=config.reference_point.point(),
         setup_covariance=setup_covariance(
             calibration.covariance,
             prism_layout.covariance,
@@ -97,6 +98,7 @@ def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
         ),
         prisms=tuple(PrismPosition(prism=p.prism, position_m=p.position_m) for p in scenario.prisms),
         pipeline=pipeline_parameters(scenario.pipeline),
+        reference_point=scenario.reference_point.point(),
     )
 
 

@@ -1,12 +1,13 @@
-"""Pipeline from measurements to poses: shared by the configuration of a master and by scenarios."""
+"""Pipeline from measurements to poses, and their reference point: shared by the configuration of a master and by scenarios."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from tsgt.config.base import Model, NotNegative, Positive
+from tsgt.config.base import Model, NotNegative, Place, Positive
+from tsgt.model import ROBOT_FRAME, ReferencePoint, Row4
 
 # The limits of the estimator, see MotionPrior.
 Acceleration = Annotated[float, Field(ge=1e-6, le=1e6)]
@@ -60,3 +61,25 @@ class PipelineConfig(Model):
     """Maximum position sigma of a valid predicted pose, at the reference point; for `continuous`."""
     predicted_rotation_sigma_limit_deg: Annotated[float, Field(gt=0, le=180)] = 5.0
     """Maximum rotation sigma of a valid predicted pose; for `continuous`."""
+
+
+class ReferencePointConfig(Model):
+    """Frame on the robot whose pose is streamed, recorded and exported: of a sensor, for example."""
+
+    name: str = ROBOT_FRAME
+    """Name of the frame; the robot frame's own name unless another one is given."""
+    position_m: Place = (0.0, 0.0, 0.0)
+    """Its origin in the robot frame, [x, y, z]."""
+    orientation_xyzw: Row4 = (0.0, 0.0, 0.0, 1.0)
+    """Unit quaternion [x, y, z, w] that rotates its coordinates into the robot frame."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> ReferencePointConfig:
+        self.point()
+        return self
+
+    def point(self) -> ReferencePoint:
+        """Return the point. Raises ValueError if there is none such."""
+        return ReferencePoint(
+            name=self.name, position_m=self.position_m, orientation_xyzw=self.orientation_xyzw
+        )

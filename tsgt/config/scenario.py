@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from tsgt.config.base import Model, NoiseConfig, NotNegative, Number, Place, Positive, unique_by
-from tsgt.config.pipeline import PipelineConfig
+from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 
 # Sigma of a Gaussian: below a time step it has no effect, far above a mission it takes for ever.
 Smoothing = Annotated[float, Field(ge=0.01, le=1000)]
@@ -221,6 +221,8 @@ class ScenarioConfig(Model):
     """Radios and channel."""
     pipeline: PipelineConfig = PipelineConfig()
     """Estimator and limits."""
+    reference_point: ReferencePointConfig = ReferencePointConfig()
+    """Reference point of the poses: the robot frame by default."""
 
     @model_validator(mode="after")
     def _consistent(self) -> ScenarioConfig:

@@ -13,9 +13,11 @@ from tsgt.estimation.observations import build_observations, instrument_time_sig
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.reference_point import (
+    POINT_COMMENT,
     centroid_at_point,
     centroid_point,
     parse_reference_point,
+    point_label,
     poses_at,
     records_at,
     reference_point_text,
@@ -33,6 +35,7 @@ from tsgt.estimation.tracks import (
 
 __all__ = [
     "MAX_DISTANCE_M",
+    "POINT_COMMENT",
     "ContinuousPoseOutput",
     "Degradation",
     "Kind",
@@ -51,6 +54,7 @@ __all__ = [
     "measured_at_ns",
     "noise_scales",
     "parse_reference_point",
+    "point_label",
     "poses_at",
     "records_at",
     "reference_point_text",

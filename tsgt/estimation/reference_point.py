@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from tsgt.model import Parameters
     from tsgt.recording import PoseRecord
 
+POINT_COMMENT = "# reference_point:"
+"""Begins the comment of a TUM file that states the point of its poses, as :func:`reference_point_text`."""
+
 _RECORDS_PER_CHUNK = 1024
 
 
@@ -196,3 +199,8 @@ def parse_reference_point(text: str) -> ReferencePoint:
 def reference_point_text(point: ReferencePoint) -> str:
     """Return what :func:`parse_reference_point` parses, to the last bit."""
     return f"{point.name}={','.join(map(repr, (*point.position_m, *point.orientation_xyzw)))}"
+
+
+def point_label(point: ReferencePoint) -> str:
+    """Return the name of a point in a sentence or a table."""
+    return "the robot's origin" if point.name == ROBOT_FRAME else point.name

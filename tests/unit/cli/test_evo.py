@@ -1,55 +1,108 @@
-"""Agreement of ``evo`` with ``tsgt evaluate --reference``."""
+"""Agreement of ``evo`` on exported files with ``tsgt evaluate --reference``: to 1e-6 m and 1e-6 degrees, unaligned."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
 from harness.authors_files import write_prisms, write_tracks
-from harness.scene import LAYOUT
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from harness.cli import Tsgt
 
+LIDAR = "lidar=0.8,-0.3,-1.2,0.1,-0.2,0.3,0.9273618495495704"
 
-@pytest.mark.parametrize("estimator", ["linear", "continuous"])
-def test_evo_agrees_with_evaluate(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, estimator: str
-) -> None:
-    """To 1e-6 m and 1e-6 degrees, unaligned, at the prisms' centroid, without 2 s at both ends of the reference."""
+
+@pytest.fixture
+def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
+    """Ten seconds of driving, as points."""
+    path = tmp_path / "drive.jsonl"
+    sources = ("--tracks", *write_tracks(tmp_path), "--prisms", write_prisms(tmp_path))
+    assert tsgt("import", "rts", *sources, "--output", path).code == 0
+    return path
+
+
+@pytest.fixture
+def evo_ape(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[Path, Path], tuple[int, float, float]]:
+    """Return what evo_ape says of a reference and a file: number, rms in m and in degrees, without 2 s at both ends."""
     monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
     metrics = pytest.importorskip("evo.core.metrics")
     sync = pytest.importorskip("evo.core.sync")
     read = pytest.importorskip("evo.tools.file_interface").read_tum_trajectory_file
-    recording, files = tmp_path / "drive.jsonl", {}
-    tracks, prisms = write_tracks(tmp_path), write_prisms(tmp_path)
-    assert tsgt("import", "rts", "--tracks", *tracks, "--prisms", prisms, "--output", recording).code == 0
-    for name in ("linear", "continuous"):
-        poses, files[name] = tmp_path / f"{name}.jsonl", tmp_path / f"{name}.tum"
+
+    def ape(reference_path: Path, path: Path) -> tuple[int, float, float]:
+        reference, found = read(str(reference_path)), read(str(path))
+        found.reduce_to_time_range(reference.timestamps[0] + 2.0, reference.timestamps[-1] - 2.0)
+        pair = sync.associate_trajectories(reference, found, max_diff=1e-6)
+
+        def rms(relation: Any) -> float:
+            metric = metrics.APE(relation)
+            metric.process_data(pair)
+            return float(metric.get_statistic(metrics.StatisticsType.rmse))
+
+        relation = metrics.PoseRelation
+        return pair[0].num_poses, rms(relation.translation_part), rms(relation.rotation_angle_deg)
+
+    return ape
+
+
+@pytest.mark.parametrize("point", ["0,0,0", LIDAR], ids=["origin", "point"])
+@pytest.mark.parametrize("estimator", ["linear", "continuous"])
+def test_evo_agrees_with_evaluate(
+    tsgt: Tsgt,
+    recording: Path,
+    evo_ape: Callable[[Path, Path], tuple[int, float, float]],
+    estimator: str,
+    point: str,
+) -> None:
+    """At the robot's origin and at a point of the user's own, with its own axes; the reference file states its point."""
+    files = {name: recording.with_name(f"{name}.tum") for name in ("linear", "continuous")}
+    for name, path in files.items():
+        poses = recording.with_name(f"{name}.jsonl")
         assert tsgt("process", recording, "--estimator", name, "--output", poses).code == 0
-        assert tsgt("export", poses, "--format", "tum", "--output", files[name]).code == 0
+        assert tsgt("export", poses, "--point", point, "--output", path).code == 0
     other = files["continuous" if estimator == "linear" else "linear"]
-    arguments = ["--estimator", estimator, "--reference", other, "--no-held-out", "--json"]
+    arguments = ["--estimator", estimator, "--reference", other, "--no-held-out", "--json", "--point", point]
     ours = tsgt("evaluate", recording, *arguments).json()
-
-    to_centroid = np.eye(4)
-    to_centroid[:3, 3] = LAYOUT.mean(axis=0)
-    reference, poses_of_evo = read(str(other)), read(str(files[estimator]))
-    poses_of_evo.reduce_to_time_range(reference.timestamps[0] + 2.0, reference.timestamps[-1] - 2.0)
-    for trajectory in (reference, poses_of_evo):
-        trajectory.transform(to_centroid, right_mul=True)
-    pair = sync.associate_trajectories(reference, poses_of_evo, max_diff=1e-6)
-
-    def rms(relation: Any) -> float:
-        ape = metrics.APE(relation)
-        ape.process_data(pair)
-        return float(ape.get_statistic(metrics.StatisticsType.rmse))
-
-    assert pair[0].num_poses == ours["compared"] > 100
+    compared, position_m, rotation_deg = evo_ape(other, files[estimator])
+    assert compared == ours["compared"] > 100
     assert ours["position_rms_mm"] > 0.5
-    relation = metrics.PoseRelation
-    assert rms(relation.translation_part) == pytest.approx(ours["position_rms_mm"] / 1e3, abs=1e-6)
-    assert rms(relation.rotation_angle_deg) == pytest.approx(ours["orientation_rms_deg"], abs=1e-6)
+    assert ours["position_rms_mm"] != pytest.approx(ours["centroid"]["position_rms_mm"], abs=0.1)
+    assert position_m == pytest.approx(ours["position_rms_mm"] / 1e3, abs=1e-6)
+    assert rotation_deg == pytest.approx(ours["orientation_rms_deg"], abs=1e-6)
+
+
+def test_reference_of_the_robot_is_carried_over(
+    tsgt: Tsgt, recording: Path, evo_ape: Callable[[Path, Path], tuple[int, float, float]]
+) -> None:
+    """A reference of the robot's origin and poses of another point are compared at the latter, as both files there are."""
+    plain, at_point, found = (recording.with_name(f"{name}.tum") for name in ("plain", "at_point", "found"))
+    assert tsgt("process", recording, "--estimator", "linear", "--output", plain).code == 0
+    assert (
+        tsgt("process", recording, "--estimator", "linear", "--point", LIDAR, "--output", at_point).code == 0
+    )
+    assert tsgt("process", recording, "--point", LIDAR, "--output", found).code == 0
+    arguments = ["--no-held-out", "--json", "--point", LIDAR, "--reference"]
+    ours = tsgt("evaluate", recording, *arguments, plain).json()
+    _, position_m, rotation_deg = evo_ape(at_point, found)
+    assert position_m == pytest.approx(ours["position_rms_mm"] / 1e3, abs=1e-6)
+    assert rotation_deg == pytest.approx(ours["orientation_rms_deg"], abs=1e-6)
+
+
+def test_point_of_a_reference_without_comments_can_be_given(tsgt: Tsgt, recording: Path) -> None:
+    """As of a trajectory that another program wrote for its sensor."""
+    stated, bare = recording.with_name("stated.tum"), recording.with_name("bare.tum")
+    assert tsgt("process", recording, "--estimator", "linear", "--point", LIDAR, "--output", stated).code == 0
+    lines = stated.read_text(encoding="utf-8").splitlines(keepends=True)
+    bare.write_text("".join(line for line in lines if not line.startswith("#")), encoding="utf-8")
+    arguments = ("evaluate", recording, "--no-held-out", "--json", "--reference")
+    expected = tsgt(*arguments, stated).json()
+    found = tsgt(*arguments, bare, "--reference-point", LIDAR).json()
+    wrong = tsgt(*arguments, bare).json()
+    assert found["position_rms_mm"] == expected["position_rms_mm"] < 100
+    assert wrong["position_rms_mm"] > 1000

@@ -46,7 +46,7 @@ def live(tmp_path: Path) -> Path:
 def xs(outcome: Outcome) -> list[float]:
     """Return the x of each line of a TUM file."""
     assert outcome.code == 0, outcome.err
-    return [float(line.split()[1]) for line in outcome.out.splitlines()]
+    return [float(line.split()[1]) for line in outcome.out.splitlines() if not line.startswith("#")]
 
 
 def read(path: Path) -> dict[str, list[Any]]:

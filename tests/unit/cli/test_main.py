@@ -97,9 +97,9 @@ def test_export_format_follows_from_the_suffix(tsgt: Tsgt, tmp_path: Path) -> No
     recording = tmp_path / "poses.jsonl"
     recording.write_bytes(recording_bytes(POSE))
     for name, options, first in (
-        ("a.tum", (), "17"),
+        ("a.tum", (), "# robot"),
         ("b.csv", (), "stamp_ns,"),
-        ("c", ("--format", "tum"), "17"),
+        ("c", ("--format", "tum"), "# robot"),
     ):
         assert tsgt("export", recording, "--output", tmp_path / name, *options) == (0, "", "")
         assert (tmp_path / name).read_text().startswith(first)

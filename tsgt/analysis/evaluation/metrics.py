@@ -20,20 +20,33 @@ EDGE_MARGIN_NS = 2_000_000_000  # Excluded at both ends: the estimator has measu
 
 @dataclass(frozen=True, slots=True)
 class PoseErrors:
-    """Errors of N poses: norm of the position error at a point of the robot, (N,), and angle of the rotation error, (N,)."""
+    """Errors of N poses."""
 
-    position_m: NDArray[np.float64]
-    rotation_rad: NDArray[np.float64]
+    position_m: NDArray[np.float64]  # (N,) norm of the position error at the reference point
+    centroid_m: NDArray[np.float64]  # (N,) at the prisms' centroid
+    rotation_rad: NDArray[np.float64]  # (N,) angle of the rotation error
 
     @property
     def position_rms_mm(self) -> float:
-        """Root mean square of the position error; NaN without poses."""
+        """Root mean square of the position error at the reference point; NaN without poses."""
         return 1e3 * _rms(self.position_m)
+
+    @property
+    def centroid(self) -> CentroidErrors:
+        """Root mean square of the position error at the prisms' centroid; NaN without poses."""
+        return CentroidErrors(1e3 * _rms(self.centroid_m))
 
     @property
     def orientation_rms_deg(self) -> float:
         """Root mean square of the rotation error; NaN without poses."""
         return math.degrees(_rms(self.rotation_rad))
+
+
+@dataclass(frozen=True, slots=True)
+class CentroidErrors:
+    """Root mean square of the position error at the prisms' centroid; NaN without poses."""
+
+    position_rms_mm: float
 
 
 NEES_95 = 12.591587  # 95th percentile of the chi-square distribution with 6 degrees of freedom
@@ -62,11 +75,12 @@ class NeesStatistics:
 
 @dataclass(frozen=True, slots=True)
 class PoseErrorStatistics:
-    """Unaligned errors of ``compared`` poses as root mean squares, and their NEES; NaN without poses."""
+    """Unaligned errors of ``compared`` poses as root mean squares, at the reference point; NaN without poses."""
 
     compared: int
     position_rms_mm: float
     orientation_rms_deg: float
+    centroid: CentroidErrors
     nees: NeesStatistics
 
     @classmethod
@@ -75,15 +89,16 @@ class PoseErrorStatistics:
         estimated: NDArray[np.float64],
         covariance: NDArray[np.float64],
         true: NDArray[np.float64],
-        point_m: NDArray[np.float64],
+        centroid_m: NDArray[np.float64],
     ) -> PoseErrorStatistics:
         """Compare as :func:`pose_errors` does; ``covariance``: (N, 6, 6) of ``estimated``, rotations about the world's axes."""
-        errors = pose_errors(estimated, true, point_m)
+        errors = pose_errors(estimated, true, centroid_m)
         rotation = log_so3(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2))
         return cls(
             compared=len(estimated),
             position_rms_mm=errors.position_rms_mm,
             orientation_rms_deg=errors.orientation_rms_deg,
+            centroid=errors.centroid,
             nees=NeesStatistics.of(
                 np.concatenate([estimated[:, :3, 3] - true[:, :3, 3], rotation], axis=1), covariance
             ),
@@ -91,15 +106,19 @@ class PoseErrorStatistics:
 
 
 def pose_errors(
-    estimated: NDArray[np.float64], true: NDArray[np.float64], point_m: NDArray[np.float64]
+    estimated: NDArray[np.float64], true: NDArray[np.float64], centroid_m: NDArray[np.float64]
 ) -> PoseErrors:
-    """Compare poses ``T_station1_robot``, (N, 4, 4), with the truth at the same instants, without alignment.
+    """Compare poses ``T_station1_point``, (N, 4, 4), with the truth at the same instants, without alignment.
 
-    ``point_m``: point of the robot whose position is compared, in its frame, (3,): usually the centroid of the prisms.
+    ``centroid_m``: the prisms' centroid in the frame of the point, (3,).
     """
-    offset = transform_points(estimated, point_m) - transform_points(true, point_m)
+    at_centroid = transform_points(estimated, centroid_m) - transform_points(true, centroid_m)
     rotation = (invert(true) @ estimated)[:, :3, :3]
-    return PoseErrors(np.linalg.norm(offset, axis=1), np.linalg.norm(log_so3(rotation), axis=1))
+    return PoseErrors(
+        np.linalg.norm(estimated[:, :3, 3] - true[:, :3, 3], axis=1),
+        np.linalg.norm(at_centroid, axis=1),
+        np.linalg.norm(log_so3(rotation), axis=1),
+    )
 
 
 def interior_mask(stamp_ns: NDArray[np.int64], start_ns: int, end_ns: int) -> NDArray[np.bool_]:
@@ -121,9 +140,10 @@ class AlignedErrorStatistics:
 
     Attributes
     ----------
-    translation_mm : Shift of the centroid of the compared positions.
+    translation_mm : Shift of the mean of the compared positions, of the reference point.
     rotation_deg : Rotation of the alignment; 0 with ``translation``.
-    position_rms_mm, orientation_rms_deg : Root mean squares after the alignment.
+    position_rms_mm, orientation_rms_deg : Root mean squares after the alignment, at the reference point.
+    centroid : The same at the prisms' centroid.
     hidden_position_mm, hidden_orientation_deg
         Root mean squares before minus after. The orientation may be negative, since only positions are aligned.
     """
@@ -132,31 +152,33 @@ class AlignedErrorStatistics:
     rotation_deg: float
     position_rms_mm: float
     orientation_rms_deg: float
+    centroid: CentroidErrors
     hidden_position_mm: float
     hidden_orientation_deg: float
 
 
 def aligned_statistics(
-    estimated: FloatArray, true: FloatArray, point_m: FloatArray, mode: Align
+    estimated: FloatArray, true: FloatArray, centroid_m: FloatArray, mode: Align
 ) -> AlignedErrorStatistics:
-    """Align poses ``T_station1_robot``, (N, 4, 4), with the truth at the same instants; compare a point, (3,) in ``robot``.
+    """Align the positions of poses with the truth, and compare; arguments as for :func:`pose_errors`.
 
     ``translation``: shift only. ``rigid``: shift and rotation without scale (Umeyama 1991), as evo's ``-a``; it raises
     DegenerateGeometryError if the positions lie in a line or coincide, or there are fewer than three.
     """
-    before = pose_errors(estimated, true, point_m)
-    points, true_points = transform_points(estimated, point_m), transform_points(true, point_m)
+    before = pose_errors(estimated, true, centroid_m)
+    points, true_points = estimated[:, :3, 3], true[:, :3, 3]
     if not len(estimated):
-        return AlignedErrorStatistics(*(math.nan,) * 6)
+        return AlignedErrorStatistics(*(math.nan,) * 4, before.centroid, math.nan, math.nan)
     rotation = align(points, true_points).rotation if mode == "rigid" else np.eye(3)
     shift = true_points.mean(axis=0) - points.mean(axis=0)
     aligned = transform_from(rotation, true_points.mean(axis=0) - rotation @ points.mean(axis=0)) @ estimated
-    after = pose_errors(aligned, true, point_m)
+    after = pose_errors(aligned, true, centroid_m)
     return AlignedErrorStatistics(
         translation_mm=1e3 * float(np.linalg.norm(shift)),
         rotation_deg=math.degrees(float(np.linalg.norm(log_so3(rotation)))),
         position_rms_mm=after.position_rms_mm,
         orientation_rms_deg=after.orientation_rms_deg,
+        centroid=after.centroid,
         hidden_position_mm=before.position_rms_mm - after.position_rms_mm,
         hidden_orientation_deg=before.orientation_rms_deg - after.orientation_rms_deg,
     )

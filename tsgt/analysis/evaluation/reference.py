@@ -12,8 +12,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tsgt.analysis.evaluation.metrics import PoseErrorStatistics, aligned_statistics, interior_mask
 from tsgt.errors import InputFileError
-from tsgt.geometry import rotation_from_quaternion, transform_from, transform_points
-from tsgt.model import MAX_COORDINATE_M, check_instants
+from tsgt.estimation import POINT_COMMENT, parse_reference_point, transform_between
+from tsgt.geometry import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform_from,
+    transform_points,
+)
+from tsgt.model import MAX_COORDINATE_M, ROBOT_ORIGIN, ReferencePoint, check_instants
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,14 +36,23 @@ MAX_INTERPOLATION_GAP_NS = 100_000_000  # At 0.5 m/s^2 a straight line is off by
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Reference poses: (N,) Unix times, strictly increasing, (N, 3) positions in frame ``station1``, (N, 4) orientations."""
+    """N reference poses of a point."""
 
-    stamp_ns: NDArray[np.int64]
-    position_m: FloatArray
-    orientation_xyzw: FloatArray
+    stamp_ns: NDArray[np.int64]  # (N,) Unix times, strictly increasing
+    position_m: FloatArray  # (N, 3) in frame ``station1``
+    orientation_xyzw: FloatArray  # (N, 4)
+    reference_point: ReferencePoint = ROBOT_ORIGIN
+
+    def of_point(self, point: ReferencePoint) -> Reference:
+        """Return the reference poses of another point."""
+        if point == self.reference_point:
+            return self
+        rotation = rotation_from_quaternion(self.orientation_xyzw)
+        T = transform_from(rotation, self.position_m) @ transform_between(self.reference_point, point)
+        return Reference(self.stamp_ns, T[:, :3, 3], quaternion_from_rotation(T[:, :3, :3]), point)
 
     def at(self, stamp_ns: NDArray[np.int64]) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return ``T_station1_robot`` interpolated at some instants, (N, 4, 4), and whether it is known there, (N,)."""
+        """Return ``T_station1_point`` interpolated at some instants, (N, 4, 4), and whether it is known there, (N,)."""
         after = np.clip(np.searchsorted(self.stamp_ns, stamp_ns), 1, len(self.stamp_ns) - 1)
         before = after - 1
         step_ns = self.stamp_ns[after] - self.stamp_ns[before]
@@ -58,7 +73,8 @@ class Reference:
 def read_tum(path: Path) -> Reference:
     """Read a trajectory: ``stamp_s x y z qx qy qz qw`` in each line; ``#`` starts a comment.
 
-    Raises InputFileError if it cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
+    A comment ``# reference_point: NAME=X,Y,Z,QX,QY,QZ,QW`` states the point of the poses; without it they are of the robot
+    frame. Raises InputFileError if it cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -68,7 +84,11 @@ def read_tum(path: Path) -> Reference:
         raise InputFileError("is not a text file", path=path) from error
     stamps: list[int] = []
     rows: list[list[float]] = []
+    point = ROBOT_ORIGIN
     for number, line in enumerate(text.splitlines(), start=1):
+        if line.startswith(POINT_COMMENT):
+            point = _stated_point(line, path, number)
+            continue
         words = line.split("#", maxsplit=1)[0].replace(",", " ").split()
         if not words:
             continue
@@ -84,8 +104,18 @@ def read_tum(path: Path) -> Reference:
     numbers = np.array(rows)
     turns = numbers[:, 3:]
     return Reference(
-        np.array(stamps, dtype=np.int64), numbers[:, :3], turns / np.linalg.norm(turns, axis=1)[:, None]
+        np.array(stamps, dtype=np.int64),
+        numbers[:, :3],
+        turns / np.linalg.norm(turns, axis=1)[:, None],
+        point,
     )
+
+
+def _stated_point(line: str, path: Path, number: int) -> ReferencePoint:
+    try:
+        return parse_reference_point(line.removeprefix(POINT_COMMENT).strip())
+    except ValueError as error:
+        raise InputFileError(str(error), path=path, line=number) from error
 
 
 def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
@@ -106,28 +136,29 @@ def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
 
 
 def match_poses(poses: PoseBatch, reference: Reference) -> tuple[NDArray[np.intp], FloatArray]:
-    """Return the rows (N,) of valid poses inside the reference, and the reference ``T_station1_robot``, (N, 4, 4), at each."""
+    """Return the rows (N,) of valid poses inside the reference, and the true pose of their point, (N, 4, 4), at each."""
+    reference = reference.of_point(poses.reference_point)
     ends_ns = int(reference.stamp_ns[0]), int(reference.stamp_ns[-1])
     rows = np.flatnonzero(poses.valid & interior_mask(poses.stamp_ns, *ends_ns))
     true, known = reference.at(poses.stamp_ns[rows])
     return rows[known], true[known]
 
 
-def compare(poses: PoseBatch, reference: Reference, point_m: FloatArray) -> PoseErrorStatistics:
+def compare(poses: PoseBatch, reference: Reference, centroid_m: FloatArray) -> PoseErrorStatistics:
     """Compare valid poses with a reference in frame ``station1``, unaligned, from 2 s after its start to 2 s before its end.
 
-    ``point_m``: point of the robot whose position is compared, (3,): the centroid of the prisms.
+    ``centroid_m``: the prisms' centroid in the frame of the poses' point, (3,).
     """
     rows, true = match_poses(poses, reference)
-    return PoseErrorStatistics.of(_transforms(poses, rows), poses.covariance[rows], true, point_m)
+    return PoseErrorStatistics.of(_transforms(poses, rows), poses.covariance[rows], true, centroid_m)
 
 
 def compare_aligned(
-    poses: PoseBatch, reference: Reference, point_m: FloatArray, mode: Align
+    poses: PoseBatch, reference: Reference, centroid_m: FloatArray, mode: Align
 ) -> AlignedErrorStatistics:
     """Compare the same poses as :func:`compare` after an alignment; see :func:`aligned_statistics`."""
     rows, true = match_poses(poses, reference)
-    return aligned_statistics(_transforms(poses, rows), true, point_m, mode)
+    return aligned_statistics(_transforms(poses, rows), true, centroid_m, mode)
 
 
 def _transforms(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:
@@ -138,46 +169,59 @@ MIN_POSES = 20  # One second at 20 Hz: intervals with fewer poses are ignored
 
 
 @dataclass(frozen=True, slots=True)
+class CentroidStationary:
+    """Position errors of the mean poses at the prisms' centroid; NaN without any."""
+
+    position_mean_mm: float
+    position_max_mm: float
+
+
+@dataclass(frozen=True, slots=True)
 class StationaryStatistics:
-    """Errors of mean poses over the stationary intervals that count (``stops``); NaN without any."""
+    """Errors of mean poses over the stationary intervals that count (``stops``), at the reference point; NaN without any."""
 
     stops: int
     position_mean_mm: float
     position_max_mm: float
     rotation_mean_deg: float
     rotation_max_deg: float
+    centroid: CentroidStationary
 
 
 @dataclass(frozen=True, slots=True)
 class StationaryErrors:
-    """Errors of the mean poses of K stationary intervals: norm of the position error, (K,), angle of the rotation error, (K,)."""
+    """Errors of the mean poses of K stationary intervals."""
 
-    position_m: FloatArray
-    rotation_rad: FloatArray
+    position_m: FloatArray  # (K,) norm of the position error at the reference point
+    centroid_m: FloatArray  # (K,) at the prisms' centroid
+    rotation_rad: FloatArray  # (K,) angle of the rotation error
 
     def statistics(self) -> StationaryStatistics:
         """Summarise the intervals."""
         if not len(self.position_m):
-            return StationaryStatistics(0, *(math.nan,) * 4)
+            return StationaryStatistics(0, *(math.nan,) * 4, CentroidStationary(math.nan, math.nan))
         position_mm, rotation_deg = 1e3 * self.position_m, np.degrees(self.rotation_rad)
+        centroid_mm = 1e3 * self.centroid_m
         return StationaryStatistics(
             stops=len(position_mm),
             position_mean_mm=float(position_mm.mean()),
             position_max_mm=float(position_mm.max()),
             rotation_mean_deg=float(rotation_deg.mean()),
             rotation_max_deg=float(rotation_deg.max()),
+            centroid=CentroidStationary(float(centroid_mm.mean()), float(centroid_mm.max())),
         )
 
 
 def stationary_errors(
-    poses: PoseBatch, reference: Reference, stationary_ns: Sequence[tuple[int, int]], point_m: FloatArray
+    poses: PoseBatch, reference: Reference, stationary_ns: Sequence[tuple[int, int]], centroid_m: FloatArray
 ) -> StationaryErrors:
     """Compare the mean pose of each stationary interval with the mean of the reference at the same instants, unaligned.
 
-    Invalid poses are ignored; ``stationary_ns``: start and end in Unix ns; ``point_m``: compared point of the robot, (3,).
+    Invalid poses are ignored; ``stationary_ns``: start and end in Unix ns; ``centroid_m``: as for :func:`compare`.
     One entry per interval with at least :data:`MIN_POSES` poses that have a reference.
     """
-    position_m, rotation_rad = [], []
+    reference = reference.of_point(poses.reference_point)
+    position_m, at_centroid_m, rotation_rad = [], [], []
     for start_ns, end_ns in stationary_ns:
         rows = np.flatnonzero(poses.valid & (poses.stamp_ns >= start_ns) & (poses.stamp_ns <= end_ns))
         true, known = reference.at(poses.stamp_ns[rows])
@@ -186,10 +230,12 @@ def stationary_errors(
             continue
         rotation = rotation_from_quaternion(poses.orientation_xyzw[rows])
         estimated = transform_from(rotation, poses.position_m[rows])
-        offset = transform_points(estimated, point_m).mean(axis=0) - transform_points(true, point_m).mean(
-            axis=0
+        error_m, centroid_error_m = (
+            (transform_points(estimated, m) - transform_points(true, m)).mean(axis=0)
+            for m in (np.zeros(3), centroid_m)
         )
         mean, true_mean = (Rotation.from_matrix(T[:, :3, :3]).mean() for T in (estimated, true))
-        position_m.append(float(np.linalg.norm(offset)))
+        position_m.append(float(np.linalg.norm(error_m)))
+        at_centroid_m.append(float(np.linalg.norm(centroid_error_m)))
         rotation_rad.append(float((true_mean.inv() * mean).magnitude()))
-    return StationaryErrors(np.array(position_m), np.array(rotation_rad))
+    return StationaryErrors(np.array(position_m), np.array(at_centroid_m), np.array(rotation_rad))

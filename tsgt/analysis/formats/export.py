@@ -6,13 +6,14 @@ import csv
 import math
 from typing import TYPE_CHECKING
 
-from tsgt.model import PointMeasurement
+from tsgt.estimation import POINT_COMMENT, reference_point_text
+from tsgt.model import WORLD_FRAME, PointMeasurement
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from tsgt.estimation import PoseBatch
-    from tsgt.model import Measurement
+    from tsgt.model import Measurement, ReferencePoint
     from tsgt.recording import PoseRecord
 
 POSE_COLUMNS = (
@@ -20,7 +21,7 @@ POSE_COLUMNS = (
     *("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad"),
     *("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"),
-    "residual_m",
+    *("residual_m", "child_frame"),
 )
 
 MEASUREMENT_COLUMNS = (
@@ -31,11 +32,15 @@ MEASUREMENT_COLUMNS = (
 )
 
 
-def tum_lines(poses: Iterable[tuple[int, Sequence[float], Sequence[float]]]) -> Iterator[str]:
+def tum_lines(
+    poses: Iterable[tuple[int, Sequence[float], Sequence[float]]], point: ReferencePoint
+) -> Iterator[str]:
     """Format valid poses (Unix ns; m; unit quaternion x, y, z, w) as the TUM benchmark does: ``stamp_s x y z qx qy qz qw``.
 
-    Seconds with nine decimals, exact to the nanosecond; metres to the nanometre.
+    Seconds with nine decimals, exact to the nanosecond; metres to the nanometre. A comment states the point of the poses.
     """
+    yield f"# {point.name} in {WORLD_FRAME}: stamp_s x y z qx qy qz qw\n"
+    yield f"{POINT_COMMENT} {reference_point_text(point)}\n"
     row = "{:d}.{:09d} {:.9f} {:.9f} {:.9f} {:.12f} {:.12f} {:.12f} {:.12f}\n".format
     for stamp_ns, position_m, orientation_xyzw in poses:
         yield row(*divmod(stamp_ns, 1_000_000_000), *position_m, *orientation_xyzw)
@@ -74,7 +79,7 @@ def pose_csv(poses: Iterable[PoseRecord]) -> Iterator[str]:
                 *sigmas,
                 *(pose.velocity_mps or [None] * 3),
                 *(pose.angular_velocity_radps or [None] * 3),
-                pose.residual_m,
+                *(pose.residual_m, pose.child_frame),
             )
         )
 

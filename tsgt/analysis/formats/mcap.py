@@ -14,9 +14,9 @@ import numpy as np
 
 import tsgt
 from tsgt.errors import MessageError, MissingExtraError
-from tsgt.estimation import build_tracks
+from tsgt.estimation import build_tracks, transform_between
 from tsgt.geometry import quaternion_from_rotation
-from tsgt.model import IDENTITY4, ROBOT_FRAME, WORLD_FRAME
+from tsgt.model import IDENTITY4, ROBOT_FRAME, ROBOT_ORIGIN, WORLD_FRAME
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -88,12 +88,13 @@ def messages(
 ) -> Iterator[Message]:
     """Yield prism positions, valid ones of ``poses`` (in the order of time) and the reference, if any, in the order of time.
 
+    ``poses`` are of the recording's reference point, to which the reference is carried over.
     Raises MessageError if a time is after January 2038, which ROS 2 cannot represent; MissingExtraError without rosbags.
     """
     tracks = build_tracks(recording.parameters, recording.measurements)
     sources = [_pose_messages(poses), *(_track_messages(prism, track) for prism, track in tracks.items())]
     if reference is not None:
-        sources.append(_reference_messages(reference))
+        sources.append(_reference_messages(reference.of_point(recording.parameters.reference_point)))
     ordered = heapq.merge(*sources, key=lambda message: message.stamp_ns)
     first = next(ordered, None)
     if first is None:
@@ -152,8 +153,14 @@ def _reference_messages(reference: Reference) -> Iterator[Message]:
 
 
 def _static_transforms(parameters: Parameters, stamp_ns: int) -> list[Any]:
-    """Return the frames of stations and prisms; without stations whose frame is the world's (1, or imported points)."""
+    """Return the frames of stations, robot and prisms; without stations whose frame is the world's (1, or imported points)."""
     transforms = []
+    point = parameters.reference_point
+    if point != ROBOT_ORIGIN:
+        # A frame has one parent: the moving transform is that of the reference point, the robot frame hangs on it.
+        T = transform_between(point, ROBOT_ORIGIN)
+        orientation = quaternion_from_rotation(T[:3, :3]).tolist()
+        transforms.append(_transform(stamp_ns, point.name, ROBOT_FRAME, T[:3, 3].tolist(), orientation))
     for station in parameters.stations:
         if station.T_station1_station != IDENTITY4:
             frame = np.array(station.T_station1_station)

@@ -17,6 +17,7 @@ from tsgt.analysis.evaluation import (
     inter_prism,
     normalised_residuals,
     outliers,
+    pose_errors,
     residual_statistics,
     stationary_errors,
 )
@@ -27,8 +28,8 @@ from tsgt.analysis.report.stations import station_records, station_statistics
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.analysis.validation import plausible_measurements
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import build_observations, build_tracks
-from tsgt.geometry import check_layout, log_so3, rotation_from_quaternion
+from tsgt.estimation import build_observations, build_tracks, centroid_at_point
+from tsgt.geometry import check_layout, rotation_from_quaternion, transform_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -62,11 +63,12 @@ _EQUIVALENT_SAMPLES = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Poses of the two estimators compared at N epochs: distance of the prisms' centroids, (N,), angle between rotations, (N,)."""
+    """Poses of the two estimators compared at N epochs."""
 
-    stamp_ns: np.ndarray[Any, np.dtype[np.int64]]
-    position_m: FloatArray
-    rotation_rad: FloatArray
+    stamp_ns: np.ndarray[Any, np.dtype[np.int64]]  # (N,)
+    position_m: FloatArray  # (N,) distance between the reference points
+    centroid_m: FloatArray  # (N,) distance between the prisms' centroids
+    rotation_rad: FloatArray  # (N,) angle between the rotations
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +98,8 @@ class Findings:
     held_out : Prediction errors, if requested.
     residuals, outliers, normalised : Of the continuous trajectory.
     reference_errors, aligned_errors, stationary_errors
-        Against the reference by estimator: unaligned, after an alignment, and mean poses of stationary intervals.
+        Against the reference by estimator: unaligned, after an alignment, and mean poses of stationary intervals; positions
+        at the reference point, and at the prisms' centroid.
     problems : Reasons for missing content, as sentences, by its name.
     """
 
@@ -201,7 +204,7 @@ def collect_findings(
             ),
         )
     report(0.9)
-    centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
+    centroid_m = centroid_at_point(parameters)
     smoothed = None if continuous is None else continuous.poses
     both: dict[Estimator, PoseBatch | None] = {"linear": linear, "continuous": smoothed}
     poses_of = {name: poses for name, poses in both.items() if poses is not None}
@@ -248,19 +251,17 @@ def collect_findings(
     )
 
 
-def difference(a: PoseBatch, b: PoseBatch, point_m: FloatArray) -> Difference:
-    """Compare poses at the epochs, which increase, at which both are valid; positions at ``point_m`` of the robot, (3,)."""
+def difference(a: PoseBatch, b: PoseBatch, centroid_m: FloatArray) -> Difference:
+    """Compare poses at the epochs, which increase, at which both are valid; ``centroid_m``: in the frame of their point, (3,)."""
     stamps, rows_a, rows_b = np.intersect1d(
         a.stamp_ns[a.valid], b.stamp_ns[b.valid], assume_unique=True, return_indices=True
     )
-    rows = np.flatnonzero(a.valid)[rows_a], np.flatnonzero(b.valid)[rows_b]
-    rotations = [rotation_from_quaternion(p.orientation_xyzw[r]) for p, r in zip((a, b), rows, strict=True)]
-    points = [p.position_m[r] + R @ point_m for p, r, R in zip((a, b), rows, rotations, strict=True)]
-    return Difference(
-        stamps,
-        np.linalg.norm(points[0] - points[1], axis=1),
-        np.linalg.norm(log_so3(np.swapaxes(rotations[0], 1, 2) @ rotations[1]), axis=1),
+    of_a, of_b = (
+        transform_from(rotation_from_quaternion(p.orientation_xyzw[r]), p.position_m[r])
+        for p, r in ((a, np.flatnonzero(a.valid)[rows_a]), (b, np.flatnonzero(b.valid)[rows_b]))
     )
+    errors = pose_errors(of_b, of_a, centroid_m)
+    return Difference(stamps, errors.position_m, errors.centroid_m, errors.rotation_rad)
 
 
 def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> PoseNoise:
@@ -286,6 +287,6 @@ def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> 
 
 
 def position_sigma_mm(poses: PoseBatch) -> FloatArray:
-    """Return the stated position sigma per axis (root mean square of the three) of each valid pose."""
+    """Return the stated position sigma per axis (root mean square of the three) of each valid pose, at its own point."""
     covariance = poses.covariance[poses.valid, :3, :3]
     return np.asarray(1e3 * np.sqrt(np.einsum("nii->n", covariance) / 3))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry import rotate, rotation_from_quaternion
+from tsgt.estimation import centroid_point, poses_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -72,25 +72,20 @@ def distance_error_series(
     parameters: Parameters, found: EpochDistances, poses: PoseBatch | None
 ) -> DistanceErrorSeries:
     """Relate inter-prism errors to the motion of the robot, which follows from ``poses`` (None: unknown)."""
-    centroid_m = np.mean([prism.position_m for prism in parameters.prisms], axis=0)
     error_m = {f"{a}-{b}": m - found.references_m[a, b] for (a, b), m in found.distances_m.items()}
     unknown = RobotMotion.unknown(len(found.stamp_ns))
-    return DistanceErrorSeries(
-        found.stamp_ns, error_m, unknown if poses is None else _motion(poses, centroid_m, found.stamp_ns)
-    )
+    if poses is None:
+        return DistanceErrorSeries(found.stamp_ns, error_m, unknown)
+    motion = _motion(poses_at(poses, centroid_point(parameters)), found.stamp_ns)
+    return DistanceErrorSeries(found.stamp_ns, error_m, motion)
 
 
-def _motion(poses: PoseBatch, centroid_m: FloatArray, epochs: NDArray[np.int64]) -> RobotMotion:
+def _motion(poses: PoseBatch, epochs: NDArray[np.int64]) -> RobotMotion:
     if len(poses) < 2:
         return RobotMotion.unknown(len(epochs))
     rows = poses.valid
-    velocity = np.full((len(poses), 3), np.nan)
-    tangential = np.cross(poses.angular_velocity_radps[rows], centroid_m)
-    velocity[rows] = poses.velocity_mps[rows] + rotate(
-        rotation_from_quaternion(poses.orientation_xyzw[rows]), tangential
-    )
     time_s = (poses.stamp_ns - poses.stamp_ns[0]) / 1e9
-    speed = np.linalg.norm(velocity, axis=1)
+    speed = np.where(rows, np.linalg.norm(poses.velocity_mps, axis=1), np.nan)
     angular_rate = np.where(rows, np.linalg.norm(poses.angular_velocity_radps, axis=1), np.nan)
     at_s = (epochs - poses.stamp_ns[0]) / 1e9
     columns = (speed, np.gradient(speed, time_s), angular_rate)

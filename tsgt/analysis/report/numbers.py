@@ -14,7 +14,7 @@ from tsgt.analysis.report.findings import position_sigma_mm
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import nan_median
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
-from tsgt.estimation import Kind
+from tsgt.estimation import Kind, centroid_point, poses_at
 
 if TYPE_CHECKING:
     from tsgt.analysis.design import Perturbation
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
+    from tsgt.model import Parameters
 
 
 def report_numbers(findings: Findings) -> dict[str, Any]:
@@ -34,13 +35,16 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
     found: dict[str, Any] = {
         "verdicts": [{"level": v.level.value, "text": v.text, "repair": v.repair} for v in verdicts(f)],
         "estimator": None if poses is None else Kind(poses.kind[0]).estimator,
+        "reference_point": dataclasses.asdict(f.recording.parameters.reference_point),
         "start_ns": f.start_ns,
         "measured_s": f.duration_s,
         "duration_s": math.nan if poses is None else int(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9,
         "poses": 0 if poses is None else len(poses),
         "valid_poses": 0 if poses is None else int(np.count_nonzero(poses.valid)),
         "invalid": {} if poses is None else poses.invalid_counts(),
-        "by_estimator": {name: pose_numbers(each) for name, each in f.poses_by_estimator.items()},
+        "by_estimator": {
+            name: pose_numbers(each, f.recording.parameters) for name, each in f.poses_by_estimator.items()
+        },
         "protocol": f.log.protocol,
         "authenticated": f.log.authenticated,
         "events": [{"stamp_ns": stamp_ns, "message": message} for stamp_ns, message in f.log.events],
@@ -101,21 +105,24 @@ def median_and_p95(values: FloatArray) -> dict[str, float]:
 
 
 def difference_numbers(difference: Difference) -> dict[str, Any]:
-    """Summarise the difference of the two estimators' poses."""
+    """Summarise the difference of the two estimators' poses, at the reference point and at the prisms' centroid."""
     return {
         "epochs": len(difference.stamp_ns),
         "position_mm": median_and_p95(1e3 * difference.position_m),
+        "centroid": {"position_mm": median_and_p95(1e3 * difference.centroid_m)},
         "rotation_deg": median_and_p95(np.degrees(difference.rotation_rad)),
     }
 
 
-def pose_numbers(poses: PoseBatch) -> dict[str, Any]:
-    """Count an estimator's poses, and summarise the stated sigmas of the valid ones."""
+def pose_numbers(poses: PoseBatch, parameters: Parameters) -> dict[str, Any]:
+    """Count an estimator's poses, and summarise the stated sigmas of the valid ones, at their point and at the centroid."""
+    at_centroid = poses_at(poses, centroid_point(parameters))
     return {
         "poses": len(poses),
         "valid_poses": int(np.count_nonzero(poses.valid)),
         "invalid": poses.invalid_counts(),
         "position_sigma_mm": median_and_p95(position_sigma_mm(poses)),
+        "centroid": {"position_sigma_mm": median_and_p95(position_sigma_mm(at_centroid))},
     }
 
 

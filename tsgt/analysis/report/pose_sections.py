@@ -20,7 +20,7 @@ from tsgt.analysis.report.page import (
     format_utc,
     page_figure,
 )
-from tsgt.estimation import Kind
+from tsgt.estimation import Kind, point_label
 from tsgt.model import PolarMeasurement
 
 if TYPE_CHECKING:
@@ -37,13 +37,14 @@ def _table(caption: str, columns: str, rows: Sequence[tuple[str, ...]]) -> Table
 
 def reference_tables(f: Findings) -> list[Table]:
     """Return tables of the aligned errors, if requested, and of the stationary intervals, if there are any."""
-    tables = []
+    tables, at = [], point_label(f.recording.parameters.reference_point)
     if f.aligned_errors:
         rows = [
             format_cells(
                 name,
                 *(
                     (a.position_rms_mm, 1),
+                    (a.centroid.position_rms_mm, 1),
                     (a.orientation_rms_deg, 3),
                     (a.translation_mm, 1),
                     (a.rotation_deg, 3),
@@ -52,11 +53,14 @@ def reference_tables(f: Findings) -> list[Table]:
             )
             for name, a in f.aligned_errors.items()
         ]
-        caption = "Aligned with the reference: remaining errors, the alignment, and the part of the rms that it hides"
+        caption = (
+            f"Aligned with the reference at {at}: remaining errors there and at the prisms' centroid, the alignment, and the "
+            "part of the rms that it hides"
+        )
         tables.append(
             _table(
                 caption,
-                "estimator|rms (mm)|rms (deg)|translation (mm)|rotation (deg)|hidden (mm)|hidden (deg)",
+                "estimator|rms (mm)|centroid (mm)|rms (deg)|translation (mm)|rotation (deg)|hidden (mm)|hidden (deg)",
                 rows,
             )
         )
@@ -64,14 +68,21 @@ def reference_tables(f: Findings) -> list[Table]:
         format_cells(
             name,
             *((s.stops, 0), (s.position_mean_mm, 2), (s.position_max_mm, 2)),
+            *((s.centroid.position_mean_mm, 2), (s.centroid.position_max_mm, 2)),
             *((s.rotation_mean_deg, 3), (s.rotation_max_deg, 3)),
         )
         for name, s in f.stationary_errors.items()
         if s.stops
     ]
     if rows:
-        caption = "Error of the mean pose of each stationary interval against the reference, unaligned"
-        tables.append(_table(caption, "estimator|intervals|mean (mm)|max (mm)|mean (deg)|max (deg)", rows))
+        caption = (
+            f"Error of the mean pose of each stationary interval against the reference, unaligned, at {at} and at the prisms' "
+            "centroid"
+        )
+        columns = (
+            "estimator|intervals|mean (mm)|max (mm)|centroid mean (mm)|centroid max (mm)|mean (deg)|max (deg)"
+        )
+        tables.append(_table(caption, columns, rows))
     return tables
 
 
@@ -83,6 +94,7 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         if name in f.problems
     ]
     tables, plots = [], []
+    at = point_label(f.recording.parameters.reference_point)
     if f.poses_by_estimator:
         tables.append(_poses_of(f))
     if f.held_out is not None:
@@ -110,14 +122,18 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
     if f.reference_errors:
         rows = [
             (
-                *format_cells(name, (e.compared, 0), (e.position_rms_mm, 1), (e.orientation_rms_deg, 3)),
+                *format_cells(name, (e.compared, 0), (e.position_rms_mm, 1), (e.centroid.position_rms_mm, 1)),
+                format_number(e.orientation_rms_deg, 3),
                 format_number(e.nees.mean),
                 "-" if math.isnan(e.nees.above_95) else f"{e.nees.above_95:.1%}",
             )
             for name, e in f.reference_errors.items()
         ]
-        columns = "estimator|poses|rms (mm)|rms (deg)|NEES (expected 6)|above 95 % (expected 5 %)"
-        tables.append(_table("Against the reference, unaligned, at the prisms' centroid", columns, rows))
+        columns = (
+            "estimator|poses|rms (mm)|centroid (mm)|rms (deg)|NEES (expected 6)|above 95 % (expected 5 %)"
+        )
+        caption = f"Against the reference, unaligned, at {at} and at the prisms' centroid"
+        tables.append(_table(caption, columns, rows))
         tables += reference_tables(f)
         if f.reference is not None and not any(e.compared for e in f.reference_errors.values()):
             text.append(
@@ -129,14 +145,16 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         difference = f.difference
         numbers = difference_numbers(difference)
         mm, deg = numbers["position_mm"], numbers["rotation_deg"]
+        centroid_mm = numbers["centroid"]["position_mm"]
         text.append(
-            f"Where both are valid ({numbers['epochs']} epochs), they differ by {mm['median']:.1f} mm and "
-            f"{deg['median']:.2f} degrees (median), {mm['p95']:.1f} mm and {deg['p95']:.2f} degrees (95 %)."
+            f"Where both are valid ({numbers['epochs']} epochs), they differ at {at} by {mm['median']:.1f} mm and "
+            f"{deg['median']:.2f} degrees (median), {mm['p95']:.1f} mm and {deg['p95']:.2f} degrees (95 %); at the prisms' "
+            f"centroid by {centroid_mm['median']:.1f} mm (median) and {centroid_mm['p95']:.1f} mm (95 %)."
         )
         plots.append(
             page_figure(
                 "estimators_apart",
-                "Difference between the poses of linear and continuous, position at the prisms' centroid.",
+                f"Difference between the poses of linear and continuous, position at {at}.",
                 panels_height_mm(2),
                 lambda figure: draw.draw_difference(figure, difference, axis),
             )
@@ -147,13 +165,19 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
 def _poses_of(f: Findings) -> Table:
     rows = []
     for name, poses in f.poses_by_estimator.items():
-        numbers = pose_numbers(poses)
-        sigma = numbers["position_sigma_mm"]
+        numbers = pose_numbers(poses, f.recording.parameters)
+        sigma, centroid = numbers["position_sigma_mm"], numbers["centroid"]["position_sigma_mm"]
         reasons = ", ".join(f"{reason} {n}" for reason, n in numbers["invalid"].items()) or "-"
         counts = format_cells(name, (numbers["poses"], 0), (numbers["valid_poses"], 0))
-        rows.append((*counts, *format_cells(reasons, (sigma["median"], 1), (sigma["p95"], 1))))
-    columns = "estimator|poses|valid|not valid|median sigma (mm)|95 % sigma (mm)"
-    return _table("Poses, and the stated position sigma per axis of the valid ones", columns, rows)
+        sigmas = (sigma["median"], sigma["p95"], centroid["median"])
+        rows.append((*counts, *format_cells(reasons, *((each, 1) for each in sigmas))))
+    columns = "estimator|poses|valid|not valid|median sigma (mm)|95 % sigma (mm)|centroid median sigma (mm)"
+    at = point_label(f.recording.parameters.reference_point)
+    return _table(
+        f"Poses, and the stated position sigma per axis of the valid ones at {at}, with that at the prisms' centroid",
+        columns,
+        rows,
+    )
 
 
 def trajectory_section(f: Findings, axis: TimeAxis) -> Section:
@@ -161,6 +185,7 @@ def trajectory_section(f: Findings, axis: TimeAxis) -> Section:
     poses = f.poses
     if poses is None:
         return Section("Trajectory", ("There are no poses.",))
+    at = point_label(poses.reference_point)
     estimator = "smoothed (continuous)" if poses.kind[0] == Kind.SMOOTHED else "interpolated (linear)"
     stations = {
         s.station: np.array(s.T_station1_station)[:3, 3]
@@ -170,19 +195,19 @@ def trajectory_section(f: Findings, axis: TimeAxis) -> Section:
     plots = (
         page_figure(
             "map",
-            "Path of the robot's origin from above.",
+            f"Path of {at} from above.",
             110.0,
             lambda figure: draw.draw_map(figure, poses, stations),
         ),
         page_figure(
             "trajectory",
-            "Position of the robot's origin in frame station1 over time, and the stated sigmas of position and rotation "
+            f"Position of {at} in frame station1 over time, and the stated sigmas of position and rotation "
             "(median and 5th to 95th percentile). Lines are interrupted where no pose is valid.",
             panels_height_mm(5),
             lambda figure: draw.draw_coordinates(figure, poses, axis),
         ),
     )
-    return Section("Trajectory", (f"Poses are {estimator}.",), plots=plots)
+    return Section("Trajectory", (f"Poses of {at}, {estimator}.",), plots=plots)
 
 
 def residual_section(f: Findings, axis: TimeAxis) -> Section:
@@ -257,7 +282,7 @@ def perturbation_section(f: Findings) -> Section:
             (
                 f"The measured mean inter-prism error of {1e3 * m.inter_prism_mean_m:.1f} mm corresponds to white noise on the "
                 f"prisms of {1e3 * m.noise_m:.1f} mm per axis. With this layout, that causes errors of "
-                f"{1e3 * m.position_norm_mean_m:.1f} mm in position (mean of the norm, at the centroid) and "
+                f"{1e3 * m.position_norm_mean_m:.1f} mm in position (mean of the norm, at the prisms' centroid) and "
                 f"{m.rotation_norm_mean_rad:.4f} rad ({math.degrees(m.rotation_norm_mean_rad):.2f} degrees) in rotation, for "
                 "a pose from one measurement of each prism."
             ),
@@ -267,7 +292,8 @@ def perturbation_section(f: Findings) -> Section:
         draw_perturbation(noise.study, noise.first_order_per_mm, paths)
 
     caption = (
-        "Pose errors over noise on the prisms, for this layout: mean and standard deviation per axis, and of the norm. "
+        "Pose errors over noise on the prisms, for this layout, positions at the prisms' centroid: mean and standard deviation "
+        "per axis, and of the norm. "
         "Dotted: first-order propagation."
     )
     return Section(title, text, plots=(ReportFigure("perturbation", caption, write),))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.report.findings import position_sigma_mm
-from tsgt.estimation import Kind
+from tsgt.estimation import Kind, point_label
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -85,8 +85,8 @@ def _poses(f: Findings) -> Iterator[Verdict]:
     sigma_mm = position_sigma_mm(poses)
     yield Verdict(
         Level.GOOD if np.median(sigma_mm) <= _SIGMA_MM else Level.CARE,
-        f"The stated position sigma of the valid poses per axis is {np.median(sigma_mm):.1f} mm (median) and "
-        f"{np.percentile(sigma_mm, 95):.1f} mm (95 %); it does not include errors common to all prisms, such as "
+        f"The stated position sigma of the valid poses per axis at {point_label(poses.reference_point)} is "
+        f"{np.median(sigma_mm):.1f} mm (median) and {np.percentile(sigma_mm, 95):.1f} mm (95 %); it does not include errors common to all prisms, such as "
         "those of a station frame.",
     )
 
@@ -230,6 +230,7 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
 
 
 def _reference(f: Findings) -> Iterator[Verdict]:
+    at = point_label(f.recording.parameters.reference_point)
     for name, each in f.reference_errors.items():
         if not each.compared:
             yield Verdict(
@@ -241,8 +242,9 @@ def _reference(f: Findings) -> Iterator[Verdict]:
         consistent = math.isfinite(each.nees.mean) and _NEES[0] <= each.nees.mean <= _NEES[1]
         yield Verdict(
             Level.GOOD if consistent else Level.CARE,
-            f"The error of {name} against the reference is {each.position_rms_mm:.1f} mm and "
-            f"{each.orientation_rms_deg:.2f} degrees (rms, unaligned)"
+            f"The error of {name} against the reference is {each.position_rms_mm:.1f} mm at {at}, "
+            f"{each.centroid.position_rms_mm:.1f} mm at the prisms' centroid, and {each.orientation_rms_deg:.2f} degrees "
+            "(rms, unaligned)"
             + (
                 "; its covariances are consistent with that."
                 if consistent

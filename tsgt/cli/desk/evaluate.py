@@ -8,12 +8,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from tsgt.analysis.evaluation import held_out_errors, inter_prism, outliers, read_tum, residual_statistics
+from tsgt.analysis.evaluation import held_out_errors, inter_prism, outliers, residual_statistics
 from tsgt.analysis.processing import process
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.cli.desk.reference import compare_estimators, print_comparisons
 from tsgt.cli.desk.report import assess, print_verdicts, report_evaluation
-from tsgt.cli.options import json_option, keep_going_option, path_type, recording_argument
+from tsgt.cli.options import (
+    json_option,
+    keep_going_option,
+    path_type,
+    point_option,
+    recording_argument,
+    reference_point_option,
+)
 from tsgt.cli.output import numbers, print_json, print_table, require_extra
 from tsgt.cli.progress import TUNING, progress
 from tsgt.cli.recordings import (
@@ -21,6 +28,7 @@ from tsgt.cli.recordings import (
     estimator_option,
     frames_option,
     load,
+    load_reference,
     motion_keys,
     motion_text,
     pose_counts,
@@ -28,7 +36,7 @@ from tsgt.cli.recordings import (
     prisms_option,
 )
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import build_observations, build_tracks
+from tsgt.estimation import build_observations, build_tracks, point_label
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,6 +46,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.cli.desk.reference import Comparison
+    from tsgt.model import ReferencePoint
     from tsgt.recording import Recording
 
 LISTED_OUTLIERS = 10
@@ -50,8 +59,10 @@ LISTED_OUTLIERS = 10
     "--reference",
     "reference_path",
     type=path_type,
-    help="Reference trajectory: TUM, of the robot frame in the frame of station 1.",
+    help="Reference trajectory: TUM, in the frame of station 1.",
 )
+@point_option
+@reference_point_option
 @click.option(
     "--align",
     type=click.Choice(["none", "translation", "rigid"]),
@@ -86,6 +97,8 @@ def evaluate(
     recording: Path,
     estimator: Estimator | None,
     reference_path: Path | None,
+    point: ReferencePoint | None,
+    reference_point: ReferencePoint | None,
     align: Literal["none", "translation", "rigid"],
     with_held_out: bool | None,
     report_folder: Path | None,
@@ -98,17 +111,22 @@ def evaluate(
     """Assess the accuracy of a recording.
 
     Prints a verdict, then internal consistency (distances between prisms, which are constant on a rigid robot;
-    residuals against the stated noise), held-out prediction errors, and errors against a reference.
+    residuals against the stated noise), held-out prediction errors, and errors against a reference. Errors and sigmas of
+    positions are at the robot's origin, or at --point; those at the centroid of the prisms stand beside them.
     """
     if odometry is not None and report_folder is None:
         raise click.UsageError("--odometry needs --report")
     alignment: Align | None = None if align == "none" else align
     if alignment is not None and reference_path is None:
         raise click.UsageError("--align needs --reference")
+    if reference_point is not None and reference_path is None:
+        raise click.UsageError("--reference-point needs --reference")
     if report_folder is not None:
         require_extra("reports", "matplotlib", "jinja2", extra="report")
-    loaded = load(recording, keep_going=keep_going, estimator=estimator, frames=frames, prisms=prisms)
-    reference = None if reference_path is None else read_tum(reference_path)
+    loaded = load(
+        recording, keep_going=keep_going, estimator=estimator, frames=frames, prisms=prisms, point=point
+    )
+    reference = load_reference(reference_path, reference_point)
     if report_folder is not None:
         report_evaluation(
             loaded,
@@ -142,6 +160,7 @@ def evaluate(
         print_json(
             {
                 "estimator": parameters.pipeline.estimator,
+                "reference_point": dataclasses.asdict(parameters.reference_point),
                 "duration_s": duration_s(poses),
                 **pose_counts(poses),
                 "epochs": found.epochs,
@@ -188,7 +207,7 @@ def evaluate(
     print_table(["station", "n", "mean", "std", "beyond 3"], rows)
     _print_outliers(rejected)
     if compared and reference_path is not None:
-        print_comparisons(compared, reference_path, alignment)
+        print_comparisons(compared, reference_path, alignment, point_label(parameters.reference_point))
 
 
 def _held_out(loaded: Recording, continuous: SmoothedRecording, path: Path) -> dict[Estimator, HeldOutErrors]:

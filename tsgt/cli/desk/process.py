@@ -16,6 +16,7 @@ from tsgt.cli.options import (
     json_option,
     keep_going_option,
     path_type,
+    point_option,
     recording_argument,
     unknown_suffix,
 )
@@ -34,7 +35,7 @@ from tsgt.cli.recordings import (
     write_lines,
     write_recording,
 )
-from tsgt.estimation import with_noise_scales
+from tsgt.estimation import point_label, with_noise_scales
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.estimation import PoseBatch
-    from tsgt.model import Parameters
+    from tsgt.model import Parameters, ReferencePoint
     from tsgt.recording import Recording
 
 FORMATS = {".tum": "tum", ".jsonl": "jsonl", ".json": "jsonl", ".csv": "csv"}
@@ -56,6 +57,7 @@ FORMATS = {".tum": "tum", ".jsonl": "jsonl", ".json": "jsonl", ".csv": "csv"}
 )
 @frames_option
 @prisms_option
+@point_option
 @click.option(
     "--format",
     "format_name",
@@ -78,6 +80,7 @@ def process(
     rate_hz: float | None,
     frames: Path | None,
     prisms: Path | None,
+    point: ReferencePoint | None,
     format_name: str | None,
     output: Path,
     keep_going: bool,
@@ -94,12 +97,18 @@ def process(
     refuse_overwrite([recording, frames, prisms], output)
     started_s = time.perf_counter()
     loaded = load(
-        recording, keep_going=keep_going, estimator=estimator, rate_hz=rate_hz, frames=frames, prisms=prisms
+        recording,
+        keep_going=keep_going,
+        estimator=estimator,
+        rate_hz=rate_hz,
+        frames=frames,
+        prisms=prisms,
+        point=point,
     )
     poses, parameters, continuous = _processed(loaded, recording)
     with progress("writing poses") as on_progress:
         if format_name == "tum":
-            write_lines(output, tum_lines(valid_rows(poses)))
+            write_lines(output, tum_lines(valid_rows(poses), poses.reference_point))
         else:
             records = counted(poses.records(), len(poses), on_progress)
             if format_name == "csv":
@@ -109,6 +118,7 @@ def process(
                 write_recording(output, source=source, parameters=parameters, records=records)
     result: dict[str, Any] = {
         "estimator": parameters.pipeline.estimator,
+        "reference_point": dataclasses.asdict(poses.reference_point),
         **pose_counts(poses),
         "seconds": time.perf_counter() - started_s,
         "duration_s": duration_s(poses),
@@ -118,7 +128,8 @@ def process(
     if as_json:
         print_json(result)
         return
-    click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements")
+    at = point_label(poses.reference_point)
+    click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements, at {at}")
     if continuous is not None:
         click.echo(motion_text(continuous.motion))
         click.echo(f"At rest: {continuous.fit.rest_s:.1f} s in {len(continuous.fit.rest)} intervals")

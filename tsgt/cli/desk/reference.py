@@ -15,7 +15,7 @@ from tsgt.analysis.evaluation import compare, compare_aligned, stationary_errors
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import numbers, print_table
 from tsgt.errors import DegenerateGeometryError, InputFileError, RecordingError
-from tsgt.estimation import PoseBatch
+from tsgt.estimation import PoseBatch, centroid_at_point
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -67,7 +67,7 @@ def compare_estimators(
         The recording and its smoothed poses.
     paths
         Of the recording and of the reference, for messages.
-    still_ns
+    stationary_ns
         Stationary intervals.
 
     Raises
@@ -76,7 +76,7 @@ def compare_estimators(
         No valid pose overlaps the reference, or the alignment is degenerate.
     """
     path, reference_path = paths
-    centroid_m = np.mean([prism.position_m for prism in loaded.parameters.prisms], axis=0)
+    centroid_m = centroid_at_point(loaded.parameters)
     try:
         linear = process(with_estimator(loaded, "linear"), path=path)
     except RecordingError:
@@ -110,24 +110,29 @@ def compare_estimators(
         ) from error
 
 
-def print_comparisons(found: dict[Estimator, Comparison], reference_path: Path, align: Align | None) -> None:
-    """Print the errors as tables."""
-    click.echo(f"\nErrors against {reference_path}, unaligned")
+def print_comparisons(
+    found: dict[Estimator, Comparison], reference_path: Path, align: Align | None, point: str
+) -> None:
+    """Print the errors as tables; ``point``: name of the reference point."""
+    click.echo(
+        f"\nErrors against {reference_path}, unaligned, positions at {point} (beside it: the prisms' centroid)"
+    )
     rows = [
         [
             name,
             str(f.compared),
-            *numbers(f.position_rms_mm, f.orientation_rms_deg, f.nees.mean, f.nees.max),
+            *numbers(f.position_rms_mm, f.centroid.position_rms_mm, f.orientation_rms_deg),
+            *numbers(f.nees.mean, f.nees.max),
             "-" if math.isnan(f.nees.above_95) else f"{f.nees.above_95:.1%}",
         ]
         for name, each in found.items()
         for f in (each.unaligned,)
     ]
-    print_table(["estimator", "n", "rms mm", "rms deg", "NEES (6)", "max", "above 95 %"], rows)
+    print_table(["estimator", "n", "rms mm", "centroid mm", "rms deg", "NEES (6)", "max", "above 95 %"], rows)
     rows = [
         [
             f"{name}, aligned",
-            *numbers(a.position_rms_mm, a.orientation_rms_deg, a.translation_mm),
+            *numbers(a.position_rms_mm, a.centroid.position_rms_mm, a.orientation_rms_deg, a.translation_mm),
             *numbers(a.rotation_deg, digits=3),
             *numbers(a.hidden_position_mm, a.hidden_orientation_deg),
         ]
@@ -137,16 +142,16 @@ def print_comparisons(found: dict[Estimator, Comparison], reference_path: Path, 
     ]
     if rows:
         click.echo(
-            f"\nAligned ({align}): remaining error, alignment, and the part of the error that it hides"
+            f"\nAligned ({align}): remaining error, alignment, and the part of the error that it hides; at {point}"
         )
-        print_table(
-            ["estimator", "rms mm", "rms deg", "shift mm", "rotation deg", "hidden mm", "hidden deg"], rows
-        )
+        header = ["rms mm", "centroid mm", "rms deg", "shift mm", "rotation deg", "hidden mm", "hidden deg"]
+        print_table(["estimator", *header], rows)
     rows = [
         [
             f"{name}, stops",
             str(s.stops),
             *numbers(s.position_mean_mm, s.position_max_mm),
+            *numbers(s.centroid.position_mean_mm, s.centroid.position_max_mm),
             *numbers(s.rotation_mean_deg, s.rotation_max_deg, digits=3),
         ]
         for name, each in found.items()
@@ -154,8 +159,9 @@ def print_comparisons(found: dict[Estimator, Comparison], reference_path: Path, 
         if s.stops
     ]
     if rows:
-        click.echo("\nMean pose of each stop, unaligned: mean and maximum error")
-        print_table(["estimator", "n", "mean mm", "max mm", "mean deg", "max deg"], rows)
+        click.echo(f"\nMean pose of each stop, unaligned: mean and maximum error at {point}")
+        header = ["n", "mean mm", "max mm", "centroid: mean mm", "max mm", "mean deg", "max deg"]
+        print_table(["estimator", *header], rows)
 
 
 def _span(stamp_ns: np.ndarray[Any, np.dtype[np.int64]]) -> str:

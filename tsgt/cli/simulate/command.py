@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shlex
 import shutil
@@ -16,7 +17,7 @@ from click.core import ParameterSource
 
 from tsgt.analysis.formats import tum_lines
 from tsgt.cli.model_options import add_options, model_option
-from tsgt.cli.options import RECORDING_SUFFIXES, OutputFile, json_option
+from tsgt.cli.options import POINT_METAVAR, RECORDING_SUFFIXES, OutputFile, PointType, json_option
 from tsgt.cli.output import CHECK_FAILED, numbers, print_json, print_table, require_new_file
 from tsgt.cli.progress import progress
 from tsgt.cli.simulate.figures import figures
@@ -24,13 +25,16 @@ from tsgt.config import (
     MAX_STATION_NUMBERS,
     ClassicMasterConfig,
     PipelineConfig,
+    ReferencePointConfig,
     ScenarioConfig,
     ScenarioRadioConfig,
     SuperframeMasterConfig,
 )
 from tsgt.errors import OutputFileError, TsgtError
+from tsgt.estimation import point_label, reference_point_text
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.log import configure_logging
+from tsgt.model import ReferencePoint
 from tsgt.recording import write_atomically
 from tsgt.simulation.checks import Violation, check_invariants
 from tsgt.simulation.faults import (
@@ -123,6 +127,13 @@ protocol_option = click.option(
     ),
     model_option(SimulationOptions, "seed"),
     click.option(
+        "--point",
+        type=PointType(),
+        metavar=POINT_METAVAR,
+        help="Point of the robot whose poses are given: position in m and quaternion in the robot frame.  "
+        "[default: that of the scenario, the robot's origin]",
+    ),
+    click.option(
         "--output", type=OutputFile(*RECORDING_SUFFIXES), help="Write the master's recording (.jsonl)."
     ),
     click.option("--truth", type=OutputFile(".tum"), help="Write the true poses (.tum)."),
@@ -141,6 +152,7 @@ def simulate_command(
     restart_texts: tuple[str, ...],
     faults_text: str,
     estimator: str | None,
+    point: ReferencePoint | None,
     output: Path | None,
     truth: Path | None,
     as_json: bool,
@@ -168,6 +180,9 @@ def simulate_command(
     if estimator is not None:
         pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
         scenario = scenario.model_copy(update={"pipeline": pipeline})
+    if point is not None:
+        config = ReferencePointConfig(**dataclasses.asdict(point))
+        scenario = scenario.model_copy(update={"reference_point": config})
     station_numbers = tuple(station.station for station in scenario.stations)
     for number in station_numbers:
         if number > MAX_STATION_NUMBERS[protocol]:
@@ -240,7 +255,8 @@ def _replay_command(context: click.Context) -> str:
             if isinstance(parameter, click.Argument):
                 words.append(shlex.quote(str(each)))
             else:
-                words += [parameter.opts[0], *([] if each is True else [shlex.quote(str(each))])]
+                text = reference_point_text(each) if isinstance(each, ReferencePoint) else str(each)
+                words += [parameter.opts[0], *([] if each is True else [shlex.quote(text)])]
     return " ".join(words)
 
 
@@ -288,15 +304,16 @@ def _write_recording(run: MissionResult, output: Path) -> None:
 
 
 def _write_truth(run: MissionResult, truth: Path) -> None:
-    """Write the true poses at the epochs of the stream, on the clock of the recording."""
+    """Write the true poses of the reference point at the epochs of the stream, on the clock of the recording."""
     period_ns = run.parameters.pipeline.period_ns
     zero_ns = run.master_logs[-1].unix_at_zero_ns
     end_ns = zero_ns + run.end_ns - run.start_ns
     stamps_ns = np.arange(-(-zero_ns // period_ns) * period_ns, end_ns + 1, period_ns, dtype=np.int64)
-    poses = run.world.pose_at((stamps_ns - zero_ns) / 1e9)
+    poses = run.true_poses((stamps_ns - zero_ns) / 1e9)
     columns = (stamps_ns, poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3]))
     with write_atomically(truth) as file:
-        file.writelines(line.encode() for line in tum_lines(zip(*(c.tolist() for c in columns), strict=True)))
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        file.writelines(line.encode() for line in tum_lines(rows, run.parameters.reference_point))
 
 
 def _print(result: dict[str, Any], found: list[Violation]) -> None:
@@ -329,13 +346,14 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
             f"{outage['start_s']:g} s: backlog drained after {_number(outage['drained_s'], 1)} s; median age of live "
             f"measurements meanwhile {_number(outage['live_age_ms']['p50'], 0)} ms"
         )
-    click.echo("\nPose errors, positions at the centroid of the prisms")
+    at = point_label(ReferencePoint(**result["reference_point"]))
+    click.echo(f"\nPose errors, positions at {at} (beside it: the prisms' centroid)")
     rows = [
         [
             name,
             str(found["poses"]),
             str(found["valid_poses"]),
-            *numbers(found["position_rms_mm"], digits=1),
+            *numbers(found["position_rms_mm"], found["centroid"]["position_rms_mm"], digits=1),
             *numbers(found["orientation_rms_deg"]),
             *numbers(found["nees"]["mean"], digits=1),
             *(_number(found["newest_ms"][key], 0) if "newest_ms" in found else "-" for key in ("p50", "p99")),
@@ -345,9 +363,11 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
             **{f"live, {kind}": found for kind, found in result["live"].items()},
         }.items()
     ]
-    print_table(
-        ["", "poses", "valid", "rms mm", "rms deg", "NEES (6)", "newest data, age ms: p50", "p99"], rows
-    )
+    header = [
+        *("", "poses", "valid", "rms mm", "centroid mm", "rms deg", "NEES (6)"),
+        *("newest data, age ms: p50", "p99"),
+    ]
+    print_table(header, rows)
     inter_prism_mm = next(iter(result["estimators"].values()))["inter_prism_mean_mm"]
     click.echo(f"\ninter-prism  {_number(inter_prism_mm, 1)} mm mean error of the distances")
     click.echo(f"\nairtime      {result['airtime_fraction']:.1%} of the time")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import math
 import shutil
 import sys
@@ -24,12 +25,14 @@ from tsgt.cli.simulate.demo_progress import Progress
 from tsgt.clock import SystemClock, UnixTimeline
 from tsgt.config import ScenarioConfig, check_permissions, load
 from tsgt.errors import OutputFileError, StreamError
+from tsgt.estimation import point_label
 from tsgt.log import configure_logging
 from tsgt.service import MAX_SOCKET_PATH_BYTES
 from tsgt.simulation.demo import Demo, write_demo_files
 from tsgt.simulation.options import SimulationOptions
 
 if TYPE_CHECKING:
+    from tsgt.model import ReferencePoint
     from tsgt.recording import Kind
     from tsgt.simulation.demo import DemoFiles
 
@@ -51,6 +54,7 @@ class PoseResult:
             "valid_poses": self.valid,
             "position_rms_mm": self.errors.position_rms_mm,
             "orientation_rms_deg": self.errors.orientation_rms_deg,
+            "centroid": dataclasses.asdict(self.errors.centroid),
         }
 
 
@@ -62,6 +66,7 @@ class Result:
     live: PoseResult | None
     restarts: int
     recording: Path | None
+    reference_point: ReferencePoint
 
 
 @click.command()
@@ -115,6 +120,7 @@ def demo(
         print_json(
             {
                 **result.poses.keys(),
+                "reference_point": dataclasses.asdict(result.reference_point),
                 **({} if result.live is None else {"live": result.live.keys()}),
                 "socket": str(socket_path),
                 "recording": None if result.recording is None else str(result.recording),
@@ -124,16 +130,19 @@ def demo(
         )
         return
     click.echo(f"poses        {result.poses.count}, of which {result.poses.valid} valid")
-    errors = result.poses.errors
+    errors, at = result.poses.errors, point_label(result.reference_point)
     if math.isnan(errors.position_rms_mm):
         click.echo("errors       no valid pose to compare; the first and the last 2 s are not used")
     else:
-        click.echo(f"position     {errors.position_rms_mm:.1f} mm rms error, at the centroid of the prisms")
+        click.echo(
+            f"position     {errors.position_rms_mm:.1f} mm rms error at {at}, "
+            f"{errors.centroid.position_rms_mm:.1f} mm at the centroid of the prisms"
+        )
         click.echo(f"orientation  {errors.orientation_rms_deg:.2f} deg rms error")
     if result.live is not None:
         click.echo(
             f"live         {result.live.valid} of {result.live.count} predictions valid, rms errors "
-            f"{result.live.errors.position_rms_mm:.1f} mm and {result.live.errors.orientation_rms_deg:.2f} deg"
+            f"{result.live.errors.position_rms_mm:.1f} mm at {at} and {result.live.errors.orientation_rms_deg:.2f} deg"
         )
     click.echo(f"files        {folder}: configuration, logs, journals")
     if result.recording is not None:
@@ -167,6 +176,7 @@ def _run(
         live=_poses(progress, "predicted") if progress.poses["predicted"] else None,
         restarts=sum(max(0, process.starts - 1) for process in demo.processes),
         recording=_kept(sorted(files.recordings.glob("*.jsonl")), output),
+        reference_point=demo.parameters.reference_point,
     )
 
 

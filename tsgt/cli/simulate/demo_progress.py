@@ -14,6 +14,7 @@ import numpy as np
 
 from tsgt.analysis.evaluation import PoseErrors, pose_errors
 from tsgt.cli.status import station_label
+from tsgt.estimation import centroid_at_point, point_label, transform_of
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.recording import EventRecord, PoseRecord, StatusRecord, decode
 
@@ -40,6 +41,7 @@ class _ValidPoses:
     waiting: list[PoseRecord] = field(default_factory=list)
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     position_m: array[float] = field(default_factory=lambda: array("d"))
+    centroid_m: array[float] = field(default_factory=lambda: array("d"))
     rotation_rad: array[float] = field(default_factory=lambda: array("d"))
 
 
@@ -107,7 +109,8 @@ class Progress:
         """Return the errors of the valid poses of a kind: of all, or of those in the mask."""
         compared = self._compared(kind)
         chosen = slice(None) if mask is None else mask
-        return PoseErrors(np.array(compared.position_m)[chosen], np.array(compared.rotation_rad)[chosen])
+        columns = (compared.position_m, compared.centroid_m, compared.rotation_rad)
+        return PoseErrors(*(np.array(column)[chosen] for column in columns))
 
     def _compared(self, kind: Kind) -> _ValidPoses:
         """Compare the waiting poses with the truth."""
@@ -116,14 +119,16 @@ class Progress:
         stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
         positions = np.array([pose.position_m for pose in poses], dtype=np.float64).reshape(-1, 3)
         quaternions = np.array([pose.orientation_xyzw for pose in poses], dtype=np.float64).reshape(-1, 4)
-        world = self._demo.world
+        parameters = self._demo.parameters
+        truth = self._demo.world.pose_at((stamps_ns - self._start_ns) / 1e9)
         errors = pose_errors(
             transform_from(rotation_from_quaternion(quaternions), positions),
-            world.pose_at((stamps_ns - self._start_ns) / 1e9),
-            world.prisms_m.mean(axis=0),
+            truth @ transform_of(parameters.reference_point),
+            centroid_at_point(parameters),
         )
         valid.stamps_ns.extend(stamps_ns.tolist())
         valid.position_m.extend(errors.position_m.tolist())
+        valid.centroid_m.extend(errors.centroid_m.tolist())
         valid.rotation_rad.extend(errors.rotation_rad.tolist())
         return valid
 
@@ -153,7 +158,8 @@ class Progress:
         text = f"{elapsed_s:5.0f} s  {len(errors.position_m)}/{self.poses[self.kind]} poses valid"
         if newest is not None:
             position = " ".join(f"{value:6.2f}" for value in newest.position_m or ())
-            text += f"  at {position} m  error {errors.position_rms_mm:.1f} mm rms"
+            at = point_label(self._demo.parameters.reference_point)
+            text += f"  {at} at {position} m  error {errors.position_rms_mm:.1f} mm rms"
         lines = [text]
         for station in status.stations:
             label, _ = station_label(station)

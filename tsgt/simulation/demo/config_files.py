@@ -125,6 +125,11 @@ prism_layout = "prism_layout.toml"
 {pipeline}
 motion = {{ {_inline(motion)} }}
 
+[reference_point]
+name = {json.dumps(scenario.reference_point.name)}
+position_m = {json.dumps(scenario.reference_point.position_m)}
+orientation_xyzw = {json.dumps(scenario.reference_point.orientation_xyzw)}
+
 [stream]
 socket = {json.dumps(str(files.socket))}
 

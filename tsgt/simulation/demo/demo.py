@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.config import scenario_parameters
 from tsgt.errors import StreamError
 from tsgt.simulation.demo.processes import Process
 from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
@@ -51,6 +52,8 @@ class Demo:
     ----------
     world
         Ground truth; its zero is ``start_ns``.
+    parameters
+        The master's parameters, which its configuration states.
     processes
         The clients in the order of the stations, then the master.
     """
@@ -66,6 +69,7 @@ class Demo:
             2 + len(scenario.stations)
         )
         self.world = scenario_world(scenario, duration_s + STARTUP_TIMEOUT_S + 10, world_rng)
+        self.parameters = scenario_parameters(scenario)
         self.start_ns = clock.monotonic_ns()  # CLOCK_MONOTONIC at the start of the world, in ns
         self.processes = [
             Process(

@@ -73,6 +73,7 @@ def master_config(scenario: ScenarioConfig, options: SimulationOptions, folder: 
         radio=radio_config(scenario, MASTER, folder),
         protocol=options.protocol,
         pipeline=scenario.pipeline,
+        reference_point=scenario.reference_point,
         stream=StreamConfig(socket=folder / "poses.sock"),
         recording=RecordingConfig(directory=folder, fsync_interval_s=_NO_FSYNC_S),
     )

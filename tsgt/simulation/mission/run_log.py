@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
+from tsgt.estimation import transform_of
 from tsgt.model import PolarMeasurement
 from tsgt.recording import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord, decode_line, read_lines
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
@@ -304,3 +305,7 @@ class MissionResult:
     def end_ns(self) -> int:
         """Unix time of the end on the master's clock, in ns; the drain follows."""
         return self.start_ns + round(self.duration_s * 1e9)
+
+    def true_poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the true poses of the reference point, (N, 4, 4), at N instants in s from the start."""
+        return self.world.pose_at(times_s) @ transform_of(self.parameters.reference_point)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tsgt.analysis.evaluation import interior_mask, pose_errors
 from tsgt.analysis.evaluation.metrics import aligned_statistics
 from tsgt.errors import DegenerateGeometryError
-from tsgt.geometry import transform_from, transform_points
+from tsgt.geometry import transform_from
 
 POINT_M = np.array([0.1, 0.2, 1.0])
 
@@ -22,9 +22,9 @@ def path(count: int = 50) -> np.ndarray:
 
 
 def test_rigid_alignment_hides_a_rigid_error() -> None:
-    """A frame error of 2 degrees and 50 mm at the centroid is removed, and reported as hidden."""
+    """A frame error of 2 degrees and 50 mm at the mean position is removed, and reported as hidden."""
     true = path()
-    middle = transform_points(true, POINT_M).mean(axis=0)
+    middle = true[:, :3, 3].mean(axis=0)
     turn = Rotation.from_rotvec(np.radians(2.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
     shift = np.array([0.03, 0.0, 0.04])
     off = transform_from(turn, middle + shift - turn @ middle)
@@ -33,6 +33,7 @@ def test_rigid_alignment_hides_a_rigid_error() -> None:
     assert found.rotation_deg == pytest.approx(2.0, abs=1e-6)
     assert found.position_rms_mm == pytest.approx(0.0, abs=1e-6)
     assert found.orientation_rms_deg == pytest.approx(0.0, abs=1e-5)
+    assert found.centroid.position_rms_mm == pytest.approx(0.0, abs=1e-6)
     assert found.hidden_position_mm > 50.0
     assert found.hidden_orientation_deg == pytest.approx(2.0, abs=1e-5)
 
@@ -80,13 +81,14 @@ def test_truth_has_no_error() -> None:
     np.testing.assert_allclose(errors.rotation_rad, 0.0, atol=1e-7)
 
 
-def test_position_error_is_that_of_the_point() -> None:
-    """A rotation about the chosen point moves the robot's origin, but is no position error."""
+def test_position_errors_are_those_of_their_points() -> None:
+    """A rotation about the centroid moves the robot's origin, by its lever arm, but not the centroid."""
     turn = Rotation.from_euler("y", 10, degrees=True).as_matrix()
     true = np.eye(4)[None]
     estimated = transform_from(turn, PRISM_POINT_M - turn @ PRISM_POINT_M)[None]
     errors = pose_errors(estimated, true, PRISM_POINT_M)
-    assert errors.position_m[0] == pytest.approx(0.0, abs=1e-15)
+    assert errors.centroid_m[0] == pytest.approx(0.0, abs=1e-15)
+    assert errors.position_m[0] == pytest.approx(2 * np.sin(np.radians(5)) * 1.2)
     assert math.degrees(errors.rotation_rad[0]) == pytest.approx(10.0)
 
 

@@ -11,7 +11,7 @@ from tsgt.estimation import Kind, PoseBatch, Reason
 
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000
-POINT_M = np.array([0.0, 0.0, 1.0])
+CENTROID_M = np.array([0.2, 0.0, 1.0])
 
 
 def stationary_robot(count: int = 401) -> tuple[PoseBatch, Reference]:
@@ -31,8 +31,11 @@ def test_noise_averages_out_and_offsets_remain() -> None:
     poses.position_m[200:, 1] += 0.003
     poses.orientation_xyzw[200:] = Rotation.from_euler("z", 0.4 + math.radians(1.0)).as_quat()
     stops = [(START_NS, START_NS + 4_950_000_000), (START_NS + 10 * SECOND_NS, START_NS + 20 * SECOND_NS)]
-    found = stationary_errors(poses, truth, stops, POINT_M)
+    found = stationary_errors(poses, truth, stops, CENTROID_M)
     np.testing.assert_allclose(found.position_m, [0.0, 0.003], atol=1e-9)
+    turn, true_turn = Rotation.from_euler("z", 0.4 + math.radians(1.0)), Rotation.from_euler("z", 0.4)
+    at_centroid = turn.apply(CENTROID_M) - true_turn.apply(CENTROID_M) + [0.0, 0.003, 0.0]
+    np.testing.assert_allclose(found.centroid_m, [0.0, float(np.linalg.norm(at_centroid))], atol=1e-9)
     np.testing.assert_allclose(np.degrees(found.rotation_rad), [0.0, 1.0], atol=1e-6)
     figures = found.statistics()
     assert figures.stops == 2
@@ -48,7 +51,7 @@ def test_only_instants_with_valid_poses_are_compared() -> None:
     poses.position_m[:, 0] += drift
     truth.position_m[:, 0] += drift
     poses.reason[200:] = Reason.OUTAGE
-    found = stationary_errors(poses, truth, [(START_NS, START_NS + 20 * SECOND_NS)], POINT_M)
+    found = stationary_errors(poses, truth, [(START_NS, START_NS + 20 * SECOND_NS)], CENTROID_M)
     np.testing.assert_allclose(found.position_m, [0.0], atol=1e-9)
 
 
@@ -57,6 +60,6 @@ def test_intervals_with_less_than_a_second_of_poses_are_ignored() -> None:
     poses, truth = stationary_robot()
     poses.reason[200:] = Reason.OUTAGE
     stops = [(START_NS, START_NS + 900_000_000), (START_NS + 12 * SECOND_NS, START_NS + 20 * SECOND_NS)]
-    found = stationary_errors(poses, truth, stops, POINT_M).statistics()
+    found = stationary_errors(poses, truth, stops, CENTROID_M).statistics()
     assert found.stops == 0
     assert math.isnan(found.position_mean_mm)

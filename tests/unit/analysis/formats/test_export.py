@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from harness.scene import START, driving, stationary_scene
 
+from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
 from tsgt.analysis.formats.export import MEASUREMENT_COLUMNS, POSE_COLUMNS
 from tsgt.estimation import LinearEstimator
-from tsgt.model import PointMeasurement
+from tsgt.model import ROBOT_ORIGIN, PointMeasurement, ReferencePoint
 
 if TYPE_CHECKING:
     from tsgt.estimation import PoseBatch
@@ -33,7 +34,8 @@ def poses() -> PoseBatch:
 def test_tum_timestamps_are_exact() -> None:
     """Nine decimals of an integer, with leading zeros."""
     stamps = [1_647_269_269_000_000_001, 5, 1_647_269_269_950_000_000]
-    lines = tum_lines((stamp, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for stamp in stamps)
+    rows = ((stamp, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for stamp in stamps)
+    _, _, *lines = tum_lines(rows, ROBOT_ORIGIN)
     assert [line.split()[0] for line in lines] == [
         "1647269269.000000001",
         "0.000000005",
@@ -43,7 +45,7 @@ def test_tum_timestamps_are_exact() -> None:
 
 def test_tum_contains_the_valid_poses(poses: PoseBatch) -> None:
     """One line of eight numbers per valid pose, to the nanometre."""
-    rows = np.array([line.split() for line in tum_lines(valid_rows(poses))], dtype=np.float64)
+    rows = np.loadtxt(tum_lines(valid_rows(poses), ROBOT_ORIGIN))
     assert 0 < len(rows) < len(poses)
     np.testing.assert_allclose(rows[:, 1:4], poses.position_m[poses.valid], atol=1e-9)
     np.testing.assert_allclose(rows[:, 4:], poses.orientation_xyzw[poses.valid], atol=1e-12)
@@ -51,7 +53,18 @@ def test_tum_contains_the_valid_poses(poses: PoseBatch) -> None:
 
 def test_tum_of_records_equals_tum_of_arrays(poses: PoseBatch) -> None:
     """Exporting recorded poses gives what processing gives, character by character."""
-    assert list(tum_lines(valid_records(poses.records()))) == list(tum_lines(valid_rows(poses)))
+    of_records = tum_lines(valid_records(poses.records()), ROBOT_ORIGIN)
+    assert list(of_records) == list(tum_lines(valid_rows(poses), ROBOT_ORIGIN))
+
+
+def test_tum_states_its_point(tmp_path: Path) -> None:
+    """In comments, one of which is read back."""
+    lidar = ReferencePoint(name="lidar", position_m=(0.1, 0.2, 1 / 3), orientation_xyzw=(0.0, 0.0, 0.6, 0.8))
+    rows = [(stamp, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)) for stamp in (1, 2)]
+    lines = list(tum_lines(rows, lidar))
+    assert lines[0] == "# lidar in station1: stamp_s x y z qx qy qz qw\n"
+    (tmp_path / "poses.tum").write_text("".join(lines), encoding="utf-8")
+    assert read_tum(tmp_path / "poses.tum").reference_point == lidar
 
 
 def test_pose_csv_contains_all_poses(poses: PoseBatch) -> None:

@@ -140,7 +140,7 @@ def test_every_number_of_the_page_is_in_the_json(made: Made) -> None:
     known = [v for number in numbers_in(printed) for v in (number, 100 * number)]
     shown = re.findall(r"<td>(.*?)</td>|<p>(.*?)</p>", page.split("What to trust", 1)[1], flags=re.DOTALL)
     checked = 0
-    for text in map("".join, shown):
+    for text in map(html.unescape, map("".join, shown)):
         for word in re.findall(r"(?<![\w.:-])[-+]?\d+(?:\.\d+)?(?![\w:-])", text):
             digits = len(word.partition(".")[2])
             assert word in FIXED_NUMBERS or any(f"{v:.{digits}f}" == word for v in known), (word, text)

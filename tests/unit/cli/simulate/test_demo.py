@@ -75,6 +75,7 @@ def test_progress_keeps_few_bytes_per_pose(demo: Demo, timeline: UnixTimeline) -
         (counts, progress.errors("smoothed", counts)),
     ):
         np.testing.assert_allclose(found.position_m, expected.position_m[chosen], atol=1e-9)
+        np.testing.assert_allclose(found.centroid_m, expected.centroid_m[chosen], atol=1e-9)
         np.testing.assert_allclose(found.rotation_rad, expected.rotation_rad[chosen], atol=1e-9)
 
 

@@ -37,7 +37,7 @@ def test_classic_mission(tmp_path: Path) -> None:
         assert figure.time_error_us[2] < 300
     poses = estimator_figures(run)["linear"]
     assert poses.valid_poses > 600
-    assert poses.against_truth.position_rms_mm < 40
+    assert poses.against_truth.centroid.position_rms_mm < 40
     assert poses.against_truth.orientation_rms_deg < 2
 
 
@@ -337,8 +337,8 @@ def test_superframe_delivers_everything(tmp_path: Path) -> None:
         assert figure.time_error_us[2] < 100
     poses = estimator_figures(run)
     assert poses["linear"].valid_poses > 1100
-    assert poses["linear"].against_truth.position_rms_mm < 20
-    assert poses["continuous"].against_truth.position_rms_mm < 3
+    assert poses["linear"].against_truth.centroid.position_rms_mm < 20
+    assert poses["continuous"].against_truth.centroid.position_rms_mm < 3
     assert 350 < frame_ms(run) < 450
 
 

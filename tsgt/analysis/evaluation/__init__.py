@@ -14,8 +14,10 @@ from tsgt.analysis.evaluation.ate_rpe import (
 from tsgt.analysis.evaluation.error_series import (
     COMPONENTS,
     PoseComponents,
+    PoseErrorDetails,
     component_sigmas,
     error_components,
+    error_details,
     pose_components,
 )
 from tsgt.analysis.evaluation.held_out import (
@@ -72,6 +74,7 @@ __all__ = [
     "Outlier",
     "PairDistances",
     "PoseComponents",
+    "PoseErrorDetails",
     "PoseErrorStatistics",
     "PoseErrors",
     "Reference",
@@ -86,6 +89,7 @@ __all__ = [
     "cross_validate",
     "distances_at_epochs",
     "error_components",
+    "error_details",
     "folds",
     "held_out_errors",
     "inter_prism",

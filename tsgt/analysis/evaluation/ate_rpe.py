@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -31,7 +31,7 @@ TIME_TOLERANCE = 0.01  # Epochs are regular
 class ErrorSummary:
     """Statistics of absolute values, ``std`` with divisor n; NaN without any."""
 
-    rmse: float
+    rms: float
     mean: float
     median: float
     std: float
@@ -44,7 +44,7 @@ class ErrorSummary:
         if not len(values):
             return cls(*(math.nan,) * len(dataclasses.fields(cls)))
         return cls(
-            rmse=math.sqrt(float(np.mean(values**2))),
+            rms=math.sqrt(float(np.mean(values**2))),
             mean=float(values.mean()),
             median=float(np.median(values)),
             std=float(values.std()),
@@ -58,8 +58,8 @@ class TransformErrors:
     """Summaries of ``n`` error transforms, as in the description of this file."""
 
     n: int
-    translation_m: ErrorSummary
-    rotation_deg: ErrorSummary
+    position_mm: ErrorSummary
+    orientation_deg: ErrorSummary
     full: ErrorSummary
 
     @classmethod
@@ -67,10 +67,22 @@ class TransformErrors:
         """Summarise error transforms, (N, 4, 4)."""
         return cls(
             n=len(errors),
-            translation_m=ErrorSummary.of(np.linalg.norm(errors[:, :3, 3], axis=1)),
-            rotation_deg=ErrorSummary.of(np.degrees(np.linalg.norm(log_so3(errors[:, :3, :3]), axis=1))),
+            position_mm=ErrorSummary.of(1e3 * np.linalg.norm(errors[:, :3, 3], axis=1)),
+            orientation_deg=ErrorSummary.of(np.degrees(np.linalg.norm(log_so3(errors[:, :3, :3]), axis=1))),
             full=ErrorSummary.of(np.linalg.norm(errors - np.eye(4), axis=(1, 2))),
         )
+
+    def keys(self) -> dict[str, Any]:
+        """Return the figures for ``--json``."""
+        return {
+            "n": self.n,
+            "position_rms_mm": self.position_mm.rms,
+            "orientation_rms_deg": self.orientation_deg.rms,
+            **{
+                name: dataclasses.asdict(getattr(self, name))
+                for name in ("position_mm", "orientation_deg", "full")
+            },
+        }
 
 
 def absolute_errors(estimated: FloatArray, true: FloatArray) -> TransformErrors:
@@ -135,6 +147,10 @@ class RelativeErrors:
     unit: Literal["m", "s"]
     pairs: Literal["consecutive", "all"]
     errors: TransformErrors
+
+    def keys(self) -> dict[str, Any]:
+        """Return the figures for ``--json``."""
+        return {"delta": self.delta, "unit": self.unit, "pairs": self.pairs, **self.errors.keys()}
 
 
 RELATIVE_DELTAS_M = (1.0, 10.0)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.evaluation.reference import match_poses
+from tsgt.analysis.evaluation.ate_rpe import absolute_errors, relative_error_table
+from tsgt.analysis.evaluation.reference import match_poses, transforms_of
 from tsgt.geometry import euler_angles_rad, euler_covariance, rotation_from_quaternion
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tsgt.analysis.evaluation.ate_rpe import RelativeErrors, TransformErrors
     from tsgt.analysis.evaluation.reference import Reference
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
@@ -72,3 +74,40 @@ def component_sigmas(R: FloatArray, covariance: FloatArray) -> FloatArray:
     rotation = euler_covariance(R, covariance[:, 3:, 3:])
     variances = [np.einsum("nii->ni", block) for block in (covariance[:, :3, :3], rotation)]
     return np.asarray(np.sqrt(np.concatenate(variances, axis=1)))
+
+
+@dataclass(frozen=True, slots=True)
+class PoseErrorDetails:
+    """Unaligned errors of poses against a reference, at the poses' own point: over time, absolute (ATE) and relative (RPE)."""
+
+    components: PoseComponents
+    ate: TransformErrors
+    rpe: tuple[RelativeErrors, ...]
+
+    def keys(self) -> dict[str, Any]:
+        """Return the figures for ``--json``."""
+        c = self.components
+        return {
+            "components": {
+                name: {"rms": rms, "within_2_sigma": share}
+                for name, rms, share in zip(
+                    ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg"),
+                    (np.array([1e3] * 3 + [180 / np.pi] * 3) * c.rms).tolist(),
+                    c.within_two_sigma.tolist(),
+                    strict=True,
+                )
+            },
+            "ate": self.ate.keys(),
+            "rpe": [each.keys() for each in self.rpe],
+        }
+
+
+def error_details(poses: PoseBatch, reference: Reference) -> PoseErrorDetails:
+    """Compare the valid poses that have a reference with it."""
+    rows, true = match_poses(poses, reference)
+    estimated = transforms_of(poses, rows)
+    return PoseErrorDetails(
+        error_components(poses, reference),
+        absolute_errors(estimated, true),
+        relative_error_table(estimated, true, poses.stamp_ns[rows]),
+    )

@@ -150,7 +150,7 @@ def compare(poses: PoseBatch, reference: Reference, centroid_m: FloatArray) -> P
     ``centroid_m``: the prisms' centroid in the frame of the poses' point, (3,).
     """
     rows, true = match_poses(poses, reference)
-    return PoseErrorStatistics.of(_transforms(poses, rows), poses.covariance[rows], true, centroid_m)
+    return PoseErrorStatistics.of(transforms_of(poses, rows), poses.covariance[rows], true, centroid_m)
 
 
 def compare_aligned(
@@ -158,10 +158,11 @@ def compare_aligned(
 ) -> AlignedErrorStatistics:
     """Compare the same poses as :func:`compare` after an alignment; see :func:`aligned_statistics`."""
     rows, true = match_poses(poses, reference)
-    return aligned_statistics(_transforms(poses, rows), true, centroid_m, mode)
+    return aligned_statistics(transforms_of(poses, rows), true, centroid_m, mode)
 
 
-def _transforms(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:
+def transforms_of(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:
+    """Return ``T_station1_robot`` of some poses, (N, 4, 4)."""
     return transform_from(rotation_from_quaternion(poses.orientation_xyzw[rows]), poses.position_m[rows])
 
 

@@ -6,9 +6,9 @@ Comes in: arrays and statistics of other rooms. Goes out: PNG, PDF or SVG files.
 
 from tsgt.analysis.figures.axes import (
     TimeAxis,
-    banded,
     curve,
     dots,
+    envelope,
     hatch,
     legend_above,
     note,
@@ -19,24 +19,26 @@ from tsgt.analysis.figures.axes import (
 )
 from tsgt.analysis.figures.design import draw_layouts, draw_perturbation
 from tsgt.analysis.figures.gnss import draw_gnss
-from tsgt.analysis.figures.style import FORMATS, PAGE_WIDTH_MM, drawing, save
+from tsgt.analysis.figures.style import FORMATS, PAGE_WIDTH_MM, drawing, palette_png, png_bytes, save
 
 __all__ = [
     "FORMATS",
     "PAGE_WIDTH_MM",
     "TimeAxis",
-    "banded",
     "curve",
     "dots",
     "draw_gnss",
     "draw_layouts",
     "draw_perturbation",
     "drawing",
+    "envelope",
     "hatch",
     "legend_above",
     "note",
+    "palette_png",
     "panels_height_mm",
     "plain_log",
+    "png_bytes",
     "save",
     "shade",
     "stroke",

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 PANEL_HEIGHT_MM = 26.0
 
 BUCKETS = 1500  # About the number of dots across a page at 200 dpi
-MAX_SEGMENTS = 150  # Number of segments of a band
 HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++")  # Distinguishable in greyscale
 
 
@@ -87,20 +86,18 @@ def curve(
     )
 
 
-def banded(panel: Axes, x: FloatArray, y: FloatArray, row: int, *, label: str | None) -> None:
-    """Draw a rapidly varying quantity as its median and 5th to 95th percentile."""
-    size = max(1, len(x) // MAX_SEGMENTS)
-    n = -(-len(x) // size)
-    filled = np.full(n * size, np.nan)
+def envelope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Reduce a long curve, (N,), to the maximum of each segment; NaN where a segment has no value."""
+    size = -(-len(x) // BUCKETS) if len(x) else 1
+    if size == 1:
+        return x, y
+    filled = np.full(-(-len(x) // size) * size, np.nan)
     filled[: len(y)] = y
-    segments = filled.reshape(n, size)
-    known = np.isfinite(segments).any(axis=1)
-    percentiles = np.full((3, n), np.nan)
-    percentiles[:, known] = np.nanpercentile(segments[known], (5, 50, 95), axis=1)
-    middle = x[np.minimum(np.arange(n) * size + size // 2, len(x) - 1)]
-    look = stroke(row)
-    panel.fill_between(middle, percentiles[0], percentiles[2], color=look.color, alpha=0.25, linewidth=0)
-    panel.plot(middle, percentiles[1], color=look.color, linestyle=look.linestyle, label=label)
+    segments = filled.reshape(-1, size)
+    blank = np.isnan(segments).all(axis=1)
+    most = np.max(np.where(np.isnan(segments), -np.inf, segments), axis=1)
+    middle = x[np.minimum(np.arange(len(segments)) * size + size // 2, len(x) - 1)]
+    return middle, np.where(blank, np.nan, most)
 
 
 def plain_log(axis: Axis) -> None:

@@ -5,19 +5,24 @@ verdicts, sections, page and numbers. matplotlib and jinja2 are imported when a 
 """
 
 from tsgt.analysis.report.findings import Findings, collect_findings
+from tsgt.analysis.report.headline import Headline, headline
 from tsgt.analysis.report.numbers import report_numbers
-from tsgt.analysis.report.page import render_page
-from tsgt.analysis.report.sections import sections, summary_table
+from tsgt.analysis.report.page import Images, render_page
+from tsgt.analysis.report.sections import sections
 from tsgt.analysis.report.stations import StationRecord
+from tsgt.analysis.report.trajectory_sections import map_figure
 from tsgt.analysis.report.verdicts import verdicts
 
 __all__ = [
     "Findings",
+    "Headline",
+    "Images",
     "StationRecord",
     "collect_findings",
+    "headline",
+    "map_figure",
     "render_page",
     "report_numbers",
     "sections",
-    "summary_table",
     "verdicts",
 ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.figures import hatch, stroke
-from tsgt.analysis.report.page import Section, Table, format_number, page_figure
+from tsgt.analysis.report.page import ReportFigure, Section, Table, format_number
 from tsgt.model import PolarMeasurement
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tsgt.model import TargetResidual
     from tsgt.recording import Recording
 
-TITLE = "Calibration residuals"
+TITLE = "Targets from which the station frames were solved"
 
 
 def calibration_section(recording: Recording) -> Section:
@@ -62,8 +62,9 @@ def calibration_section(recording: Recording) -> Section:
         ("station", "target", "residual (mm)", "leave-one-out (mm)"),
         tuple(rows),
     )
-    plot = page_figure(
+    plot = ReportFigure(
         "calibration",
+        "Disagreement between stations about each target",
         "Distance of each target from its position measured by station 1: residual in the solved frame, and (white) "
         "leave-one-out, in the frame solved from the other targets. A single large bar indicates a disturbed or badly aimed "
         "target, large bars of all targets a wrong target constant. Crosses: rejected targets, whose bars may exceed the axis.",

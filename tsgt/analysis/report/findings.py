@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from tsgt.analysis.design import Perturbation, equivalent_noise, first_order_sigmas, perturbation_study
+from tsgt.analysis.design import Perturbation, equivalent_noise, perturbation_study
 from tsgt.analysis.evaluation import (
     compare,
     compare_aligned,
     distances_at_epochs,
+    error_details,
     held_out_errors,
     inter_prism,
     normalised_residuals,
@@ -28,7 +29,7 @@ from tsgt.analysis.report.stations import station_records, station_statistics
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.analysis.validation import plausible_measurements
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import build_observations, build_tracks, centroid_at_point
+from tsgt.estimation import build_observations, build_tracks, centroid_at_point, point_label
 from tsgt.geometry import check_layout, rotation_from_quaternion, transform_from
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
         HeldOutErrors,
         InterPrismDistances,
         Outlier,
+        PoseErrorDetails,
         PoseErrorStatistics,
         Reference,
         ResidualStatistics,
@@ -56,7 +58,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_NOISES_M = tuple(0.02 * level for level in range(21))
+_NOISE_LEVELS = tuple(0.1 * level for level in range(21))  # Of the measured noise
 _SAMPLES = 1000
 _EQUIVALENT_SAMPLES = 20_000
 
@@ -75,13 +77,11 @@ class Difference:
 class PoseNoise:
     """Effect of prism noise on a pose, for the layout of the recording.
 
-    ``study`` is for several sigmas, ``as_measured`` for the noise that explains the mean inter-prism error (None without
-    distances), ``first_order_per_mm`` has the sigmas of position (m) and rotation (rad) for 1 mm of noise, (3,) each.
+    ``as_measured`` is for the noise that explains the mean inter-prism error, ``study`` from none to twice that noise.
     """
 
     study: list[Perturbation]
-    first_order_per_mm: tuple[FloatArray, FloatArray]
-    as_measured: Perturbation | None
+    as_measured: Perturbation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,9 +97,9 @@ class Findings:
     difference : Between the estimators.
     held_out : Prediction errors, if requested.
     residuals, outliers, normalised : Of the continuous trajectory.
-    reference_errors, aligned_errors, stationary_errors
-        Against the reference by estimator: unaligned, after an alignment, and mean poses of stationary intervals; positions
-        at the reference point, and at the prisms' centroid.
+    reference_errors, error_details, aligned_errors, stationary_errors
+        Against the reference by estimator: unaligned, by component and over distances, after an alignment, and mean poses of
+        stationary intervals; positions at the reference point, most also at the prisms' centroid.
     problems : Reasons for missing content, as sentences, by its name.
     """
 
@@ -121,6 +121,7 @@ class Findings:
     outliers: list[Outlier]
     normalised: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     reference_errors: dict[Estimator, PoseErrorStatistics]
+    error_details: dict[Estimator, PoseErrorDetails] = field(default_factory=dict)
     aligned_errors: dict[Estimator, AlignedErrorStatistics] = field(default_factory=dict)
     stationary_errors: dict[Estimator, StationaryStatistics] = field(default_factory=dict)
     reference: Reference | None = None
@@ -139,6 +140,11 @@ class Findings:
         continuous = None if self.continuous is None else self.continuous.poses
         found: dict[Estimator, PoseBatch | None] = {"linear": self.linear, "continuous": continuous}
         return {name: poses for name, poses in found.items() if poses is not None}
+
+    @property
+    def point(self) -> str:
+        """The point whose poses are shown, in words."""
+        return point_label(self.recording.parameters.reference_point)
 
     @property
     def duration_s(self) -> float:
@@ -209,12 +215,14 @@ def collect_findings(
     both: dict[Estimator, PoseBatch | None] = {"linear": linear, "continuous": smoothed}
     poses_of = {name: poses for name, poses in both.items() if poses is not None}
     errors: dict[Estimator, PoseErrorStatistics] = {}
+    details: dict[Estimator, PoseErrorDetails] = {}
     aligned: dict[Estimator, AlignedErrorStatistics] = {}
     stationary: dict[Estimator, StationaryStatistics] = {}
     if reference is not None:
         intervals_ns = () if distances is None else distances.stationary_ns
         for name, poses in poses_of.items():
             errors[name] = compare(poses, reference, centroid_m)
+            details[name] = error_details(poses, reference)
             stationary[name] = stationary_errors(poses, reference, intervals_ns, centroid_m).statistics()
             if align is not None and errors[name].compared:
                 result = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
@@ -243,6 +251,7 @@ def collect_findings(
         outliers=[] if continuous is None else outliers(continuous.fit, continuous.sources),
         normalised=np.empty((0, 3)) if continuous is None else normalised_residuals(continuous.fit),
         reference_errors=errors,
+        error_details=details,
         aligned_errors=aligned,
         stationary_errors=stationary,
         reference=reference,
@@ -276,13 +285,15 @@ def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> 
         for pair in (distances.dynamic if distances is not None else ())
     ]
     all_errors = np.concatenate(errors) if errors else np.empty(0)
-    mean_m = float(all_errors.mean()) if len(all_errors) else 0.0
+    if not all_errors.any():
+        raise GeometryError("without distances between the prisms, the noise on the prisms was not measured")
+    mean_m = float(all_errors.mean())
+    measured = equivalent_noise(
+        layout, mean_m, samples=_EQUIVALENT_SAMPLES, point_m=centroid_m, random=random
+    )
+    noises_m = [level * measured.noise_m for level in _NOISE_LEVELS]
     return PoseNoise(
-        perturbation_study(layout, _NOISES_M, samples=_SAMPLES, point_m=centroid_m, random=random),
-        first_order_sigmas(layout, 1e-3, point_m=centroid_m),
-        equivalent_noise(layout, mean_m, samples=_EQUIVALENT_SAMPLES, point_m=centroid_m, random=random)
-        if mean_m > 0.0
-        else None,
+        perturbation_study(layout, noises_m, samples=_SAMPLES, point_m=centroid_m, random=random), measured
     )
 
 
@@ -290,3 +301,9 @@ def position_sigma_mm(poses: PoseBatch) -> FloatArray:
     """Return the stated position sigma per axis (root mean square of the three) of each valid pose, at its own point."""
     covariance = poses.covariance[poses.valid, :3, :3]
     return np.asarray(1e3 * np.sqrt(np.einsum("nii->n", covariance) / 3))
+
+
+def rotation_sigma_deg(poses: PoseBatch) -> FloatArray:
+    """Return the stated rotation sigma per axis (root mean square of the three) of each valid pose."""
+    covariance = poses.covariance[poses.valid, 3:, 3:]
+    return np.asarray(np.degrees(np.sqrt(np.einsum("nii->n", covariance) / 3)))

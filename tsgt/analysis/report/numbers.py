@@ -10,17 +10,16 @@ import numpy as np
 
 from tsgt.analysis.evaluation import noise_scales_by_axis
 from tsgt.analysis.report.calibration import calibration_numbers
-from tsgt.analysis.report.findings import position_sigma_mm
+from tsgt.analysis.report.findings import position_sigma_mm, rotation_sigma_deg
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import nan_median
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
 from tsgt.estimation import Kind, centroid_point, poses_at
 
 if TYPE_CHECKING:
-    from tsgt.analysis.design import Perturbation
     from tsgt.analysis.evaluation import InterPrismDistances
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.report.findings import Difference, Findings
+    from tsgt.analysis.report.findings import Difference, Findings, PoseNoise
     from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
@@ -81,8 +80,8 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
     if f.reference_errors:
         found["estimators"] = {name: _compared(f, name) for name in f.reference_errors}
         found |= found["estimators"].get(f.recording.parameters.pipeline.estimator, {})
-    if f.pose_noise is not None and f.pose_noise.as_measured is not None:
-        found["perturbation"] = _as_measured(f.pose_noise.as_measured)
+    if f.pose_noise is not None:
+        found["perturbation"] = perturbation_numbers(f.pose_noise)
     return found
 
 
@@ -90,6 +89,7 @@ def _compared(f: Findings, name: Estimator) -> dict[str, Any]:
     """Return the errors of one estimator against the reference."""
     found = {
         **dataclasses.asdict(f.reference_errors[name]),
+        **f.error_details[name].keys(),
         "stationary": dataclasses.asdict(f.stationary_errors[name]),
     }
     aligned = f.aligned_errors.get(name)
@@ -122,6 +122,7 @@ def pose_numbers(poses: PoseBatch, parameters: Parameters) -> dict[str, Any]:
         "valid_poses": int(np.count_nonzero(poses.valid)),
         "invalid": poses.invalid_counts(),
         "position_sigma_mm": median_and_p95(position_sigma_mm(poses)),
+        "rotation_sigma_deg": median_and_p95(rotation_sigma_deg(poses)),
         "centroid": {"position_sigma_mm": median_and_p95(position_sigma_mm(at_centroid))},
     }
 
@@ -168,10 +169,14 @@ def _in_mm(sorted_errors: Bins | Grid) -> dict[str, Any]:
     }
 
 
-def _as_measured(noise: Perturbation) -> dict[str, float]:
+def perturbation_numbers(found: PoseNoise) -> dict[str, Any]:
+    """Return the pose errors that noise of the measured size causes, at the prisms' centroid."""
+    noise = found.as_measured
     return {
         "inter_prism_mean_mm": 1e3 * noise.inter_prism_mean_m,
         "noise_mm": 1e3 * noise.noise_m,
+        "position_std_mm": (1e3 * noise.position_std_m).tolist(),
+        "rotation_std_deg": np.degrees(noise.euler_std_rad).tolist(),
         "position_norm_mean_mm": 1e3 * noise.position_norm_mean_m,
         "rotation_norm_mean_rad": noise.rotation_norm_mean_rad,
         "rotation_norm_mean_deg": math.degrees(noise.rotation_norm_mean_rad),

@@ -7,12 +7,11 @@ import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.analysis.figures import PAGE_WIDTH_MM, drawing, save
-from tsgt.analysis.report.verdicts import Level
+from tsgt.analysis.figures import PAGE_WIDTH_MM, drawing, png_bytes, save
 from tsgt.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -21,20 +20,17 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from tsgt.analysis.report.verdicts import Verdict
+    from tsgt.analysis.report.headline import Headline
     from tsgt.geometry import FloatArray
 
 MAX_LISTED = 20  # Rows of a table that may be long
-_MARK = {
-    Level.GOOD: ("good", "\N{CHECK MARK}"),
-    Level.CARE: ("care", "!"),
-    Level.BAD: ("bad", "\N{MULTIPLICATION SIGN}"),
-}
+COLUMN_WIDTH_MM = 90.0  # One column of most journals: on a telephone its text is legible
+UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table; the first column names the row. Without a header it lists facts as text."""
+    """A table; the first column names the row. Without a header it lists facts: names and values."""
 
     caption: str
     header: tuple[str, ...]
@@ -43,11 +39,33 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class ReportFigure:
-    """A figure, with the name of its files without a suffix; ``write`` draws it and writes the given files."""
+    """A figure: name of its files without a suffix, title, caption, height, and the function that draws it at any width."""
 
     name: str
+    title: str
     caption: str
-    write: Callable[[Sequence[Path]], None]
+    height_mm: float
+    fill: Callable[[Figure], None]
+
+    def write(self, paths: Sequence[Path]) -> None:
+        """Draw it at page width and write the given files."""
+        with drawing(width_mm=PAGE_WIDTH_MM, height_mm=self.height_mm) as figure:
+            self.fill(figure)
+            for path in paths:
+                save(figure, path)
+
+    def narrow_png(self) -> bytes:
+        """Draw it for a narrow screen."""
+        with drawing(width_mm=COLUMN_WIDTH_MM, height_mm=self.height_mm) as figure:
+            self.fill(figure)
+            return png_bytes(figure)
+
+
+class Images(NamedTuple):
+    """PNG images of a figure for a wide and for a narrow screen."""
+
+    wide: bytes
+    narrow: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,21 +78,14 @@ class Section:
     plots: tuple[ReportFigure, ...] = ()
 
 
-def page_figure(name: str, caption: str, height_mm: float, fill: Callable[[Figure], None]) -> ReportFigure:
-    """Return a figure of page width that ``fill`` draws when it is written."""
-
-    def write(paths: Sequence[Path]) -> None:
-        with drawing(width_mm=PAGE_WIDTH_MM, height_mm=height_mm) as figure:
-            fill(figure)
-            for path in paths:
-                save(figure, path)
-
-    return ReportFigure(name, caption, write)
-
-
 def format_number(value: float, digits: int = 1) -> str:
-    """Format a number; a dash for NaN."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+    """Format a number; ``unknown`` for NaN."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else UNKNOWN
+
+
+def format_share(value: float, digits: int = 1) -> str:
+    """Format a share, 0 to 1, in percent; ``unknown`` for NaN."""
+    return f"{value:.{digits}%}" if math.isfinite(value) else UNKNOWN
 
 
 def nan_median(values: FloatArray | None) -> float:
@@ -96,12 +107,12 @@ def format_cells(name: str, *values: tuple[float, int]) -> tuple[str, ...]:
 
 def render_page(
     title: str,
-    summary: Table,
-    verdicts: Sequence[Verdict],
+    headline: Headline,
+    path_map: ReportFigure | None,
     sections: Sequence[Section],
-    images: Mapping[str, bytes],
+    images: Mapping[str, Images],
 ) -> str:
-    """Render one HTML page without external resources; ``images``: PNG by figure. Raises MissingExtraError without jinja2."""
+    """Render one HTML page without external resources; ``images``: by figure. Raises MissingExtraError without jinja2."""
     try:
         from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (an extra)
     except ImportError as error:
@@ -116,9 +127,15 @@ def render_page(
     source = files(__package__).joinpath("page.html.j2").read_text(encoding="utf-8")
     return environment.from_string(source).render(
         title=title,
-        summary=summary,
-        verdicts=verdicts,
+        key_figures=headline.key_figures,
+        headline=(
+            ("good", "\N{CHECK MARK}", "What to trust", headline.trust or ("Nothing yet.",)),
+            ("care", "!", "What not to trust", headline.doubt or ("No objection was found.",)),
+            ("todo", "\N{RIGHTWARDS ARROW}", "What to do", headline.repairs or ("Nothing.",)),
+        ),
+        map=path_map,
         sections=sections,
-        marks=_MARK,
-        images={name: base64.b64encode(image).decode("ascii") for name, image in images.items()},
+        images={
+            name: [base64.b64encode(image).decode("ascii") for image in each] for name, each in images.items()
+        },
     )

@@ -1,4 +1,4 @@
-"""Report figures: path of the robot, both estimators, residuals."""
+"""Report figures: map, both estimators, residuals, and the effect of prism noise."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import banded, curve, dots, note, plain_log, stroke
+from tsgt.analysis.figures import curve, dots, note, stroke
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from tsgt.analysis.design import Perturbation
     from tsgt.analysis.evaluation import HeldOutErrors
     from tsgt.analysis.figures import TimeAxis
     from tsgt.analysis.processing import Estimator
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
 
-_AXES = ("x", "y", "z")
-_SIGHT = ("along the line of sight", "horizontally across", "vertically across")
+_SIGHT = ("along the line\nof sight", "horizontally\nacross it", "vertically\nacross it")
 
 
 def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray]) -> None:
@@ -57,32 +57,6 @@ def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray
     panel.set_xlabel("x in frame station1 (m)")
     panel.set_ylabel("y in frame station1 (m)")
     figure.legend(loc="outside upper center", ncols=4)
-
-
-def draw_coordinates(figure: Figure, poses: PoseBatch, axis: TimeAxis) -> None:
-    """Draw the position over time, and the stated sigmas of position and rotation below."""
-    axes = figure.subplots(5, 1, sharex=True)
-    time, valid = axis.of(poses.stamp_ns), poses.valid
-    sigma = np.sqrt(np.einsum("nii->ni", poses.covariance))
-    sigma[~valid] = np.nan
-    position = np.where(valid[:, None], poses.position_m, np.nan)
-    for row, name in enumerate(_AXES):
-        curve(axes[row], time, position[:, row], 1, label=None, dashes=False)
-        axes[row].set_ylabel(f"{name} (m)")
-    for row, (columns, label) in enumerate(
-        (([0, 1], "horizontally; about x and y"), ([2], "in height; about z"))
-    ):
-        rms = [np.sqrt(np.mean(sigma[:, [c + first for c in columns]] ** 2, axis=1)) for first in (0, 3)]
-        banded(axes[3], time, 1e3 * rms[0], row, label=label)
-        banded(axes[4], time, np.degrees(rms[1]), row, label=None)
-    axes[3].set_ylabel("position\nsigma (mm)")
-    axes[4].set_ylabel("rotation\nsigma (deg)")
-    for panel in axes[3:]:
-        plain_log(panel.yaxis)
-    axes[4].set_xlabel(axis.label)
-    figure.align_ylabels(axes)
-    handles, labels = axes[3].get_legend_handles_labels()
-    figure.legend(handles, [f"sigma {x}" for x in labels], loc="outside upper center", ncols=2)
 
 
 def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -> None:
@@ -149,6 +123,31 @@ def draw_residuals(
         axes[row, 0].set_ylabel(f"station {number}\n(sigmas)")
     axes[0, 0].set_ylim(-6, 6)
     figure.supxlabel(axis.label, fontsize=8)
+
+
+def draw_perturbation(figure: Figure, study: Sequence[Perturbation], measured_m: float) -> None:
+    """Draw the standard deviations of the pose error along each axis, and its mean norm, over the noise of the prisms."""
+    axes = figure.subplots(1, 2, sharex=True)
+    noise_mm = [1e3 * each.noise_m for each in study]
+    position_mm = 1e3 * np.array([(*each.position_std_m, each.position_norm_mean_m) for each in study])
+    rotation_deg = np.degrees([(*each.euler_std_rad, each.rotation_norm_mean_rad) for each in study])
+    panels = (
+        (axes[0], position_mm, ("x", "y", "z", "mean length"), "position error (mm)"),
+        (axes[1], rotation_deg, ("roll", "pitch", "yaw", "mean angle"), "rotation error (deg)"),
+    )
+    for panel, values, names, label in panels:
+        for row, name in enumerate(names):
+            look = stroke(row)
+            panel.plot(noise_mm, values[:, row], color=look.color, linestyle=look.linestyle, label=name)
+            panel.plot(
+                noise_mm[::5], values[::5, row], color=look.color, linestyle="none", marker=look.marker
+            )
+        panel.axvline(1e3 * measured_m, color="black", linestyle=":", linewidth=0.8)
+        panel.set_ylabel(label)
+        panel.set_xlabel("noise per coordinate (mm)")
+        panel.set_xlim(0.0, noise_mm[-1])
+        panel.set_ylim(bottom=0.0)
+        panel.legend(loc="upper left")
 
 
 def _with_gaps(difference: Difference) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:

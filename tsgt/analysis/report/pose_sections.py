@@ -1,15 +1,14 @@
-"""Report sections on poses: both estimators, the trajectory, residuals, and the effect of prism noise."""
+"""Report sections on the estimators: held-out prediction, residuals, and the effect of prism noise."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import draw_perturbation, panels_height_mm
+from tsgt.analysis.figures import panels_height_mm
 from tsgt.analysis.report import pose_figures as draw
-from tsgt.analysis.report.numbers import difference_numbers, pose_numbers
+from tsgt.analysis.report.numbers import difference_numbers, perturbation_numbers, pose_numbers
 from tsgt.analysis.report.page import (
     MAX_LISTED,
     ReportFigure,
@@ -17,73 +16,15 @@ from tsgt.analysis.report.page import (
     Table,
     format_cells,
     format_number,
+    format_share,
     format_utc,
-    page_figure,
 )
-from tsgt.estimation import Kind, point_label
-from tsgt.model import PolarMeasurement
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
     from tsgt.analysis.figures import TimeAxis
     from tsgt.analysis.report.findings import Findings
 
-
-def _table(caption: str, columns: str, rows: Sequence[tuple[str, ...]]) -> Table:
-    return Table(caption, tuple(columns.split("|")), tuple(rows))
-
-
-def reference_tables(f: Findings) -> list[Table]:
-    """Return tables of the aligned errors, if requested, and of the stationary intervals, if there are any."""
-    tables, at = [], point_label(f.recording.parameters.reference_point)
-    if f.aligned_errors:
-        rows = [
-            format_cells(
-                name,
-                *(
-                    (a.position_rms_mm, 1),
-                    (a.centroid.position_rms_mm, 1),
-                    (a.orientation_rms_deg, 3),
-                    (a.translation_mm, 1),
-                    (a.rotation_deg, 3),
-                ),
-                *((a.hidden_position_mm, 1), (a.hidden_orientation_deg, 3)),
-            )
-            for name, a in f.aligned_errors.items()
-        ]
-        caption = (
-            f"Aligned with the reference at {at}: remaining errors there and at the prisms' centroid, the alignment, and the "
-            "part of the rms that it hides"
-        )
-        tables.append(
-            _table(
-                caption,
-                "estimator|rms (mm)|centroid (mm)|rms (deg)|translation (mm)|rotation (deg)|hidden (mm)|hidden (deg)",
-                rows,
-            )
-        )
-    rows = [
-        format_cells(
-            name,
-            *((s.stops, 0), (s.position_mean_mm, 2), (s.position_max_mm, 2)),
-            *((s.centroid.position_mean_mm, 2), (s.centroid.position_max_mm, 2)),
-            *((s.rotation_mean_deg, 3), (s.rotation_max_deg, 3)),
-        )
-        for name, s in f.stationary_errors.items()
-        if s.stops
-    ]
-    if rows:
-        caption = (
-            f"Error of the mean pose of each stationary interval against the reference, unaligned, at {at} and at the prisms' "
-            "centroid"
-        )
-        columns = (
-            "estimator|intervals|mean (mm)|max (mm)|centroid mean (mm)|centroid max (mm)|mean (deg)|max (deg)"
-        )
-        tables.append(_table(caption, columns, rows))
-    return tables
+_COMPONENTS = {"range": "distance", "horizontal_angle": "horizontal angle", "zenith_angle": "zenith angle"}
 
 
 def estimator_section(f: Findings, axis: TimeAxis) -> Section:
@@ -94,141 +35,118 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         if name in f.problems
     ]
     tables, plots = [], []
-    at = point_label(f.recording.parameters.reference_point)
-    if f.poses_by_estimator:
-        tables.append(_poses_of(f))
     if f.held_out is not None:
+        text.append(
+            "Each measurement in turn was left out and predicted from all others, by each estimator. The difference between "
+            "prediction and measurement contains the noise of the measurement."
+        )
         rows = [
             format_cells(label, (m.n, 0), (m.mean, 1), (m.median, 1), (m.p95, 1))
             for name, each in f.held_out.items()
             for label, m in ((name, each.statistics), (f"{name}, at gaps over 1 s", each.gaps))
+            if m.n
         ]
-        tables.append(_table("Held-out prediction error (mm)", "estimator|n|mean|median|95 %", rows))
+        header = ("estimator", "measurements", "mean", "median", "95 %")
+        tables.append(
+            Table("Prediction error of left-out measurements, a point of a prism (mm)", header, tuple(rows))
+        )
         held_out = f.held_out
         plots.append(
-            page_figure(
+            ReportFigure(
                 "held_out",
-                "Cumulative distribution of the held-out prediction error of each estimator, including the measurement "
-                "noise: further up and left is better.",
+                "Prediction error of left-out measurements",
+                "Share of the left-out measurements that are predicted better than the error on the axis: a curve further up "
+                "and left is better.",
                 65.0,
                 lambda figure: draw.draw_held_out(figure, held_out),
             )
         )
     else:
+        why = f.problems.get("held_out")
         text.append(
-            f"The held-out prediction error was not computed{f': {why}' if (why := f.problems.get('held_out')) else ''}; "
-            "--held-out does it, and takes several times as long."
+            f"How well left-out measurements are predicted was not computed{f': {why}' if why else ''}; `--held-out` does it, "
+            "and takes several times as long."
         )
-    if f.reference_errors:
-        rows = [
-            (
-                *format_cells(name, (e.compared, 0), (e.position_rms_mm, 1), (e.centroid.position_rms_mm, 1)),
-                format_number(e.orientation_rms_deg, 3),
-                format_number(e.nees.mean),
-                "-" if math.isnan(e.nees.above_95) else f"{e.nees.above_95:.1%}",
-            )
-            for name, e in f.reference_errors.items()
-        ]
-        columns = (
-            "estimator|poses|rms (mm)|centroid (mm)|rms (deg)|NEES (expected 6)|above 95 % (expected 5 %)"
-        )
-        caption = f"Against the reference, unaligned, at {at} and at the prisms' centroid"
-        tables.append(_table(caption, columns, rows))
-        tables += reference_tables(f)
-        if f.reference is not None and not any(e.compared for e in f.reference_errors.values()):
-            text.append(
-                f"The reference does not overlap with valid poses in time: it covers {format_utc(int(f.reference.stamp_ns[0]))} to "
-                f"{format_utc(int(f.reference.stamp_ns[-1]))}, the recording {format_utc(f.start_ns)} to {format_utc(f.end_ns)} "
-                "(all UTC); 2 s at both ends are excluded."
-            )
+    if f.poses_by_estimator:
+        tables.append(_poses_of(f))
     if f.difference is not None and len(f.difference.stamp_ns):
         difference = f.difference
         numbers = difference_numbers(difference)
         mm, deg = numbers["position_mm"], numbers["rotation_deg"]
         centroid_mm = numbers["centroid"]["position_mm"]
         text.append(
-            f"Where both are valid ({numbers['epochs']} epochs), they differ at {at} by {mm['median']:.1f} mm and "
-            f"{deg['median']:.2f} degrees (median), {mm['p95']:.1f} mm and {deg['p95']:.2f} degrees (95 %); at the prisms' "
-            f"centroid by {centroid_mm['median']:.1f} mm (median) and {centroid_mm['p95']:.1f} mm (95 %)."
+            f"Where the poses of both estimators are valid ({numbers['epochs']} epochs), they differ at {f.point} by "
+            f"{mm['median']:.1f} mm and {deg['median']:.2f} degrees (median), {mm['p95']:.1f} mm and {deg['p95']:.2f} degrees "
+            f"(95 %); at the prisms' centroid by {centroid_mm['median']:.1f} mm (median) and {centroid_mm['p95']:.1f} mm (95 %)."
         )
         plots.append(
-            page_figure(
+            ReportFigure(
                 "estimators_apart",
-                f"Difference between the poses of linear and continuous, position at {at}.",
+                "Difference between the poses of both estimators",
+                f"Distance between the two positions of {f.point}, and angle between the two rotations. It is not an error, but "
+                "where it is large one of them is wrong.",
                 panels_height_mm(2),
                 lambda figure: draw.draw_difference(figure, difference, axis),
             )
         )
-    return Section("Both estimators", tuple(text), tuple(tables), tuple(plots))
+    return Section(
+        "Both estimators, and prediction of left-out measurements", tuple(text), tuple(tables), tuple(plots)
+    )
 
 
 def _poses_of(f: Findings) -> Table:
     rows = []
     for name, poses in f.poses_by_estimator.items():
         numbers = pose_numbers(poses, f.recording.parameters)
-        sigma, centroid = numbers["position_sigma_mm"], numbers["centroid"]["position_sigma_mm"]
-        reasons = ", ".join(f"{reason} {n}" for reason, n in numbers["invalid"].items()) or "-"
+        position, rotation = numbers["position_sigma_mm"], numbers["rotation_sigma_deg"]
+        reasons = ", ".join(f"{reason} {n}" for reason, n in numbers["invalid"].items()) or "none"
         counts = format_cells(name, (numbers["poses"], 0), (numbers["valid_poses"], 0))
-        sigmas = (sigma["median"], sigma["p95"], centroid["median"])
-        rows.append((*counts, *format_cells(reasons, *((each, 1) for each in sigmas))))
-    columns = "estimator|poses|valid|not valid|median sigma (mm)|95 % sigma (mm)|centroid median sigma (mm)"
-    at = point_label(f.recording.parameters.reference_point)
-    return _table(
-        f"Poses, and the stated position sigma per axis of the valid ones at {at}, with that at the prisms' centroid",
-        columns,
-        rows,
+        sigmas = (
+            *(
+                (position["median"], 1),
+                (position["p95"], 1),
+                (numbers["centroid"]["position_sigma_mm"]["median"], 1),
+            ),
+            *((rotation["median"], 3), (rotation["p95"], 3)),
+        )
+        rows.append((*counts, *format_cells(reasons, *sigmas)))
+    header = (
+        *("estimator", "poses", "valid", "not valid", "median (mm)", "95 % (mm)", "centroid median (mm)"),
+        *("median (deg)", "95 % (deg)"),
     )
-
-
-def trajectory_section(f: Findings, axis: TimeAxis) -> Section:
-    """Return the section on the trajectory."""
-    poses = f.poses
-    if poses is None:
-        return Section("Trajectory", ("There are no poses.",))
-    at = point_label(poses.reference_point)
-    estimator = "smoothed (continuous)" if poses.kind[0] == Kind.SMOOTHED else "interpolated (linear)"
-    stations = {
-        s.station: np.array(s.T_station1_station)[:3, 3]
-        for s in f.recording.parameters.stations
-        if any(isinstance(m, PolarMeasurement) and m.station == s.station for m in f.recording.measurements)
-    }
-    plots = (
-        page_figure(
-            "map",
-            f"Path of {at} from above.",
-            110.0,
-            lambda figure: draw.draw_map(figure, poses, stations),
-        ),
-        page_figure(
-            "trajectory",
-            f"Position of {at} in frame station1 over time, and the stated sigmas of position and rotation "
-            "(median and 5th to 95th percentile). Lines are interrupted where no pose is valid.",
-            panels_height_mm(5),
-            lambda figure: draw.draw_coordinates(figure, poses, axis),
-        ),
+    caption = (
+        f"Stated standard deviation per axis of the valid poses: position of {f.point}, beside it at the prisms' centroid (mm), and "
+        "rotation (deg)"
     )
-    return Section("Trajectory", (f"Poses of {at}, {estimator}.",), plots=plots)
+    return Table(caption, header, tuple(rows))
 
 
 def residual_section(f: Findings, axis: TimeAxis) -> Section:
     """Return the section on the residuals of the continuous trajectory."""
+    title = "How well the measurements fit the trajectory"
     if f.continuous is None:
-        return Section("Residuals", ("Unknown without the continuous trajectory.",))
+        return Section(title, ("Unknown without the continuous trajectory.",))
+    motion = f.continuous.motion
+    text = (
+        f"The noise of the measurements is {motion.noise_scale:.2f} times the stated noise of the instruments"
+        + ("." if motion.tuned else ", as recorded: there are too few measurements to estimate it."),
+    )
     rows = [
         (
-            f"{station} {axis.replace('_', ' ')}",
+            f"{station} {_COMPONENTS.get(component, component.replace('_', ' '))}",
             str(e.n),
             format_number(e.mean, 2),
             format_number(e.std, 2),
-            f"{e.beyond_3_sigma:.2%}",
+            format_share(e.beyond_3_sigma, 2),
         )
-        for station, axes in f.residuals.items()
-        for axis, e in axes.items()
+        for station, components in f.residuals.items()
+        for component, e in components.items()
     ]
     tables = [
         Table(
-            "Normalised residuals of the continuous trajectory (expected: 0, 1, 0.27 %)",
-            ("station", "n", "mean", "std", "beyond 3"),
+            "Difference between measurement and trajectory, divided by its expected standard deviation (expected: mean 0, "
+            "standard deviation 1, 0.27 % beyond 3)",
+            ("station", "measurements", "mean", "standard deviation", "beyond 3"),
             tuple(rows),
         )
     ]
@@ -246,54 +164,61 @@ def residual_section(f: Findings, axis: TimeAxis) -> Section:
         more = f"; the {MAX_LISTED} worst of {len(f.outliers)}" if len(f.outliers) > MAX_LISTED else ""
         tables.append(
             Table(
-                f"Rejected outliers{more}",
-                ("time (UTC)", "station", "prism", "mm", "sigmas"),
+                f"Measurements that were rejected because they are far from the trajectory{more}",
+                ("time (UTC)", "station", "prism", "distance (mm)", "in standard deviations"),
                 tuple(listed),
             )
         )
     sources = f.continuous.sources
     stamps = np.array([m.stamp_ns for m in sources], dtype=np.int64)
     numbers = np.array([m.station for m in sources], dtype=np.int64)
-    plot = page_figure(
+    plot = ReportFigure(
         "residuals",
-        "Residuals over time in sigmas: trajectory minus measurement. A constant offset indicates an error of a frame, a "
-        "constant or a latency; a drifting one a tripod that moved. Dashed: 3 sigmas; values beyond 6 are drawn at the edge.",
+        "Difference between measurement and trajectory over time",
+        "In standard deviations: trajectory minus measurement. An offset that stays indicates an error of a station frame, a "
+        "prism constant or a latency; one that drifts, a tripod that moved. Dashed: 3 standard deviations; values beyond 6 are "
+        "drawn at the edge.",
         panels_height_mm(len(np.unique(numbers))),
         lambda figure: draw.draw_residuals(figure, f.normalised, stamps, numbers, axis),
     )
-    motion = f.continuous.motion
-    text = (
-        f"The noise of the measurements is {motion.noise_scale:.2f} times the stated noise of the instruments"
-        + ("." if motion.tuned else ", as recorded: there are too few measurements to estimate it."),
-    )
-    return Section("Residuals", text, tuple(tables), (plot,))
+    return Section(title, text, tuple(tables), (plot,))
 
 
 def perturbation_section(f: Findings) -> Section:
     """Return the section on the effect of prism noise on a pose."""
-    title = "Effect of prism noise on a pose"
+    title = "What noise on the prisms does to a pose"
     noise = f.pose_noise
     if noise is None:
         return Section(title, (f"Unknown: {f.problems['pose_noise']}.",))
-    text: tuple[str, ...] = ()
-    if noise.as_measured is not None:
-        m = noise.as_measured
-        text = (
-            (
-                f"The measured mean inter-prism error of {1e3 * m.inter_prism_mean_m:.1f} mm corresponds to white noise on the "
-                f"prisms of {1e3 * m.noise_m:.1f} mm per axis. With this layout, that causes errors of "
-                f"{1e3 * m.position_norm_mean_m:.1f} mm in position (mean of the norm, at the prisms' centroid) and "
-                f"{m.rotation_norm_mean_rad:.4f} rad ({math.degrees(m.rotation_norm_mean_rad):.2f} degrees) in rotation, for "
-                "a pose from one measurement of each prism."
-            ),
-        )
-
-    def write(paths: Sequence[Path]) -> None:
-        draw_perturbation(noise.study, noise.first_order_per_mm, paths)
-
-    caption = (
-        "Pose errors over noise on the prisms, for this layout, positions at the prisms' centroid: mean and standard deviation "
-        "per axis, and of the norm. "
-        "Dotted: first-order propagation."
+    numbers = perturbation_numbers(noise)
+    text = (
+        f"The measured distances between the prisms are wrong by {numbers['inter_prism_mean_mm']:.1f} mm on average. White noise "
+        f"of {numbers['noise_mm']:.1f} mm (1 sigma) on each coordinate of each prism would cause that. With this prism layout, "
+        "such noise causes the errors below in a pose that is computed from one measurement of each prism."
     )
-    return Section(title, text, plots=(ReportFigure("perturbation", caption, write),))
+    rows = [
+        format_cells(
+            name, *((value, 1) for value in (*numbers["position_std_mm"], numbers["position_norm_mean_mm"]))
+        )
+        for name in ("position (mm)",)
+    ] + [
+        format_cells(
+            name, *((value, 3) for value in (*numbers["rotation_std_deg"], numbers["rotation_norm_mean_deg"]))
+        )
+        for name in ("rotation (deg)",)
+    ]
+    table = Table(
+        "Standard deviation (1 sigma) along or about the robot's axes, and mean length or angle; position of the "
+        "prisms' centroid",
+        ("error", "x", "y", "z", "mean length or angle"),
+        tuple(rows),
+    )
+    plot = ReportFigure(
+        "perturbation",
+        "Pose error over the noise of the prisms",
+        "Standard deviation along or about each axis of the robot, and mean length or angle, of the error of the prisms' "
+        "centroid and of the rotation. Dotted vertical line: the noise that explains the measured distances.",
+        60.0,
+        lambda figure: draw.draw_perturbation(figure, noise.study, noise.as_measured.noise_m),
+    )
+    return Section(title, (text,), (table,), (plot,))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,20 +13,16 @@ from tsgt.analysis.report.calibration import calibration_section
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import (
     MAX_LISTED,
+    UNKNOWN,
     ReportFigure,
     Section,
     Table,
     format_number,
     format_utc,
     nan_median,
-    page_figure,
 )
-from tsgt.analysis.report.pose_sections import (
-    estimator_section,
-    perturbation_section,
-    residual_section,
-    trajectory_section,
-)
+from tsgt.analysis.report.pose_sections import estimator_section, perturbation_section, residual_section
+from tsgt.analysis.report.trajectory_sections import pose_section, reference_section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,24 +34,27 @@ if TYPE_CHECKING:
 
 
 def sections(f: Findings) -> list[Section]:
-    """Return all sections in their order."""
+    """Return all sections in their order: those that help most to decide come first."""
     axis = TimeAxis.over(f.start_ns, f.end_ns)
-    return [
-        _stations(f, axis),
-        _clocks(f, axis),
-        _distances(f, axis),
-        _by_motion(f),
+    found = (
+        pose_section(f, axis),
+        reference_section(f, axis),
         estimator_section(f, axis),
-        trajectory_section(f, axis),
+        _distances(f, axis),
         residual_section(f, axis),
         calibration_section(f.recording),
+        _stations(f, axis),
+        _clocks(f, axis),
+        _by_motion(f),
         perturbation_section(f),
-    ]
+        _recording(f),
+    )
+    return [section for section in found if section is not None]
 
 
-def summary_table(f: Findings) -> Table:
+def _recording(f: Findings) -> Section:
     """Return the facts about the recording."""
-    parameters, poses = f.recording.parameters, f.poses
+    parameters = f.recording.parameters
     rows = [
         ("file", f.path.name),
         ("written by", f"{f.recording.header.software}, {f.recording.header.source}"),
@@ -62,110 +62,118 @@ def summary_table(f: Findings) -> Table:
         ("duration", f"{f.duration_s:.1f} s"),
         ("stations, prisms", f"{len(parameters.stations)}, {len(parameters.prisms)}"),
         ("measurements", f"{sum(e.measurements for e in f.station_statistics.values())}"),
-        ("radio", f.log.protocol or "not recorded"),
-        (
-            "valid poses",
-            "none" if poses is None else f"{np.count_nonzero(poses.valid)} of {len(poses)}",
-        ),
+        ("radio protocol", f.log.protocol or UNKNOWN),
         ("events recorded", f"{len(f.log.events)}"),
     ]
-    return Table("", (), tuple(rows))
+    tables = [Table("", (), tuple(rows))]
+    if f.log.events:
+        listed = [(format_utc(stamp_ns), message) for stamp_ns, message in f.log.events[:MAX_LISTED]]
+        more = f", the first {MAX_LISTED} of {len(f.log.events)}" if len(f.log.events) > MAX_LISTED else ""
+        tables.append(Table(f"Events{more}", ("time (UTC)", "event"), tuple(listed)))
+    return Section("About this recording", tables=tuple(tables))
 
 
 def _stations(f: Findings, axis: TimeAxis) -> Section:
     outage_limit_s = f.recording.parameters.pipeline.outage_limit_ns / 1e9
-    rows = []
+    columns: dict[str, list[str]] = {
+        name: [] for name in (
+            "station", "prisms", "measured", "usable", "per second", "longest gap (s)",
+            f"gaps over {outage_limit_s:g} s (of the time)", "distance (m)", "delay median / 95 % (s)",
+            "signal RSSI (dBm)", "signal to noise (dB)", "radio loss (%)",
+        )
+    }  # fmt: skip
     for record in f.station_records:
         each = f.station_statistics[record.station]
         series = f.log.radio.get(record.station)
-        rows.append(
-            (
-                str(record.station),
-                ", ".join(map(str, record.prisms)) or "-",
-                str(each.measurements),
-                str(each.usable),
-                format_number(each.rate_hz, 2),
-                format_number(each.longest_gap_s, 2),
-                f"{each.gaps} ({each.in_gaps:.1%})",
-                f"{format_number(each.distance_min_m, 0)} to {format_number(each.distance_max_m, 0)}",
-                f"{format_number(each.delay_median_s, 2)} / {format_number(each.delay_p95_s, 2)}",
-                *(
-                    format_number(nan_median(values), digits)
-                    for values, digits in (
-                        (None if series is None else series.rssi_dbm, 0),
-                        (None if series is None else series.snr_db, 1),
-                        (None if series is None else 100 * series.loss, 1),
-                    )
-                ),
-            )
+        cells = (
+            str(record.station),
+            ", ".join(map(str, record.prisms)) or "none",
+            str(each.measurements),
+            str(each.usable),
+            format_number(each.rate_hz, 2),
+            format_number(each.longest_gap_s, 2),
+            f"{each.gaps} ({each.in_gaps:.1%})",
+            _pair(each.distance_min_m, " to ", each.distance_max_m, 0),
+            _pair(each.delay_median_s, " / ", each.delay_p95_s, 2),
+            format_number(nan_median(None if series is None else series.rssi_dbm), 0),
+            format_number(nan_median(None if series is None else series.snr_db), 1),
+            format_number(nan_median(None if series is None else 100 * series.loss), 1),
         )
-    header = (
-        "station", "prisms", "measured", "usable", "Hz", "longest gap (s)", f"gaps > {outage_limit_s:g} s (of the time)",
-        "distance (m)", "delay median / 95 % (s)", "RSSI (dBm)", "SNR (dB)", "loss (%)",
-    )  # fmt: skip
+        for column, cell in zip(columns.values(), cells, strict=True):
+            column.append(cell)
+    unknown = [name for name, cells in columns.items() if all(cell == UNKNOWN for cell in cells)]
+    shown = {name: cells for name, cells in columns.items() if name not in unknown}
+    text = [f"Unknown, because it was not recorded: {', '.join(unknown)}."] if unknown else []
+    caption = "Measurements of the stations; median of the radio's figures; delay from a measurement to its arrival at the master"
+    table = Table(caption, tuple(shown), tuple(zip(*shown.values(), strict=True)))
     n = len(f.station_records)
     plots = [
-        page_figure(
+        ReportFigure(
             "gaps",
-            "Time from the previous usable measurement to each usable one, and unusable measurements (crosses at the "
-            "bottom). Regular points near the bottom are good; gaps above the dotted line make poses invalid. Diamonds: time "
-            "from the first measurement of all stations to the first of this one, and from its last to the last of all.",
+            "Gaps between the measurements of each station",
+            "Each point is a usable measurement; its height is the time since the previous one. Points in one line near the "
+            "bottom are good; gaps above the dotted line make poses invalid. Crosses: measurements that the instrument could "
+            "not make. Diamonds: the station began later, or ended earlier, than the others.",
             panels_height_mm(n),
             lambda figure: draw.draw_gaps(figure, f.station_records, axis, outage_limit_s, f.end_ns),
-        ),
-        page_figure(
-            "statuses",
-            "Status of the measurements.",
-            24.0 + 9.0 * n,
-            lambda figure: draw.draw_statuses(figure, f.station_records),
-        ),
+        )
     ]
-    text = [] if f.log.radio else ["The recording contains no radio status: RSSI, SNR and loss are unknown."]
+    if any(len(s.statuses) > 1 for s in f.station_records):
+        plots.append(
+            ReportFigure(
+                "statuses",
+                "What the instruments reported about their measurements",
+                "`low_accuracy` is normal while the robot moves.",
+                24.0 + 9.0 * n,
+                lambda figure: draw.draw_statuses(figure, f.station_records),
+            )
+        )
     radio = {k: v for k, v in f.log.radio.items() if np.isfinite(v.rssi_dbm).any()}
     if radio:
         plots.append(
-            page_figure(
+            ReportFigure(
                 "radio",
-                "Reception of the stations by the master. Losses at a low SNR indicate distance or antennas; losses at "
-                "a high SNR indicate collisions or an overloaded computer.",
+                "Radio reception of each station",
+                "Strength of the signal (RSSI), ratio of signal to noise (SNR), and lost requests. Losses at a low ratio indicate "
+                "distance or antennas, losses at a high one collisions or an overloaded computer.",
                 panels_height_mm(3),
                 lambda figure: draw.draw_radio(figure, radio, axis),
             )
         )
-    events: tuple[Table, ...] = ()
-    if f.log.events:
-        listed = [(format_utc(stamp_ns), message) for stamp_ns, message in f.log.events[:MAX_LISTED]]
-        more = f", the first {MAX_LISTED} of {len(f.log.events)}" if len(f.log.events) > MAX_LISTED else ""
-        events = (Table(f"Events{more}", ("time (UTC)", "event"), tuple(listed)),)
-    caption = "Medians of RSSI, SNR and loss; the delay is from the measurement to its arrival."
-    return Section("Stations", tuple(text), (Table(caption, header, tuple(rows)), *events), tuple(plots))
+    return Section("Stations and radio", tuple(text), (table,), tuple(plots))
+
+
+def _pair(first: float, sign: str, second: float, digits: int) -> str:
+    """Format two numbers that are known together."""
+    return f"{first:.{digits}f}{sign}{second:.{digits}f}" if math.isfinite(first + second) else UNKNOWN
 
 
 def _clocks(f: Findings, axis: TimeAxis) -> Section:
     bounded = any(np.isfinite(s.bound_ns).any() for s in f.station_records)
     if not bounded and not f.log.clocks:
         return Section(
-            "Clocks",
-            ("The recording contains neither synchronisations nor timestamp bounds.",),
+            "Clocks of the stations",
+            ("Unknown: the recording contains neither synchronisations nor bounds of the time errors.",),
         )
     text = []
     if not f.log.clocks:
         text.append(
-            "No synchronisations were recorded. The protocol superframe has none: times of measurements are relative to "
-            "beacons, and the bounds below include that."
+            "No synchronisations were recorded. The protocol superframe has none: times of measurements are relative to the "
+            "master's beacons, and the bounds below include that."
         )
     caption = (
         "Top, if recorded: offset of the station's clock from the master's (positive: station ahead), with its bound. "
-        "Below: bound of the time error of each measurement. A millisecond is a millimetre at 1 m/s."
+        "Below: bound of the time error of each measurement. At 1 m/s, a millisecond moves a prism by a millimetre."
     )
     rows = bool(f.log.clocks) + sum(bool(np.isfinite(s.bound_ns).any()) for s in f.station_records)
-    plot = page_figure(
+    plot = ReportFigure(
         "clocks",
+        "Time errors of the measurements",
         caption,
         panels_height_mm(rows) + 8 * rows,
         lambda figure: draw.draw_clocks(figure, f.log.clocks, f.station_records, axis),
     )
-    return Section("Clocks", tuple(text), plots=(plot,))
+    return Section("Clocks of the stations", tuple(text), plots=(plot,))
 
 
 def _distances(f: Findings, axis: TimeAxis) -> Section:
@@ -177,12 +185,16 @@ def _distances(f: Findings, axis: TimeAxis) -> Section:
         return Section(title, ("The tracks of the prisms do not overlap in time.",))
     text = [
         (
-            f"{found.epochs - found.invalid_epochs} of {found.epochs} epochs at 20 Hz have no gap in any track. The robot was "
-            f"stationary for {found.stationary_s:.1f} s in {len(found.stationary_ns)} intervals (shaded below)."
+            f"At {found.epochs - found.invalid_epochs} of {found.epochs} instants (20 per second) all prisms were measured without a "
+            "gap. The robot was "
+            f"stationary for {found.stationary_s:.1f} s in {len(found.stationary_ns)} intervals (shaded below). A robot is rigid: "
+            "each distance should always be that of the prism layout."
         )
     ]
     if not found.stationary_ns:
-        text.append("There is no stationary interval of 3 s or more, so there are no stationary statistics.")
+        text.append(
+            "The robot never stood still for 3 s or more, so there are no distances of a stationary robot."
+        )
     if f.odometry_stationary_ns and not found.stationary_ns:
         text.append(
             f"According to the odometry the robot was stationary from {format_utc(f.odometry_stationary_ns[0][0])} to "
@@ -191,25 +203,31 @@ def _distances(f: Findings, axis: TimeAxis) -> Section:
         )
     if not np.isfinite(errors.motion.speed_mps).any():
         text.append("Speed and angular rate are unknown, since there are no poses.")
-    header = ("pair", "n", "layout (mm)", "mean (mm)", "std (mm)", "mean |error| (mm)", "95 % |error| (mm)")
+    header = (
+        "prisms", "number", "layout (mm)", "mean (mm)", "standard deviation (mm)", "mean error (mm)", "95 % error (mm)",
+    )  # fmt: skip
     tables = (
-        Table("Stationary: raw pairs", header, _pairs(found.static)),
-        Table("At 20 Hz, interpolated", header, _pairs(found.dynamic)),
+        Table(
+            "Distances while the robot stood still, measurements as they are", header, _pairs(found.static)
+        ),
+        Table("Distances at all times, interpolated between measurements", header, _pairs(found.dynamic)),
     )
     height_mm = panels_height_mm(len(errors.error_m) + 2)
     plots = (
-        page_figure(
+        ReportFigure(
             "distances",
-            "Distances minus those of the layout (black line). Stationary, a mean (dashed) other than 0 indicates an error of "
-            "the layout, a frame or a prism constant; the width is the instruments' noise. Values beyond the axis count in the "
-            "outermost bins.",
+            "Errors of the distances between prisms",
+            "Measured distance minus that of the layout (solid line: 0; dashed: mean). While the robot stands still, a mean other "
+            "than 0 indicates an error of the prism layout, a station frame or a prism constant; the width is the instruments' "
+            "noise. Values beyond the axis count in the outermost bins.",
             90.0,
             lambda figure: draw.draw_histograms(figure, found),
         ),
-        page_figure(
+        ReportFigure(
             "distances_over_time",
-            "The same over time, interpolated, with the robot's speed and angular rate. An error proportional to speed "
-            "indicates a time offset; peaks at starts and stops are due to linear interpolation between measurements.",
+            "Errors of the distances between prisms over time",
+            "With speed and angular rate of the robot; grey: it stood still. An error proportional to the speed indicates a time "
+            "offset; peaks at starts and stops are due to linear interpolation between measurements.",
             height_mm,
             lambda figure: draw.draw_distance_errors(figure, errors, found.stationary_ns, axis),
         ),
@@ -218,7 +236,7 @@ def _distances(f: Findings, axis: TimeAxis) -> Section:
 
 
 def _by_motion(f: Findings) -> Section:
-    title = "Errors by motion"
+    title = "Errors of the distances by the motion of the robot"
     errors = f.distance_errors
     if errors is None or not np.isfinite(errors.motion.speed_mps).any():
         return Section(title, ("Unknown: requires the distances between all prisms, and poses.",))
@@ -230,9 +248,10 @@ def _by_motion(f: Findings) -> Section:
     if all(found is None for _, found in bins):
         return Section(title, ("There are too few distances, or the robot did not move.",))
     plots = [
-        page_figure(
+        ReportFigure(
             "errors_by_motion",
-            "Distance errors of all pairs by the motion of the robot; below, their number (the outermost bins include "
+            "Errors of the distances by speed, acceleration and angular rate",
+            "Errors of all pairs by the motion of the robot; below, their number (the outermost bins include "
             "values beyond them). Acceleration is the derivative of the speed: negative while braking.",
             75.0,
             lambda figure: draw.draw_bins(figure, bins),
@@ -251,10 +270,13 @@ def _grids(error_m: FloatArray, motion: RobotMotion, names: tuple[str, str, str]
     if not found:
         return []
     caption = (
-        "Mean error in mm by two quantities. Cells with fewer than 20 distances are empty; the outermost ones include "
+        "Mean error in mm. Cells with fewer than 20 distances are empty; the outermost ones include "
         "values beyond them."
     )
-    return [page_figure("errors_by_two", caption, 80.0, lambda figure: draw.draw_grids(figure, found))]
+    title = "Errors of the distances by two quantities at a time"
+    return [
+        ReportFigure("errors_by_two", title, caption, 80.0, lambda figure: draw.draw_grids(figure, found))
+    ]
 
 
 def _pairs(pairs: Sequence[PairDistances]) -> tuple[tuple[str, ...], ...]:

@@ -28,7 +28,7 @@ class StationRecord:
     ----------
     usable : (N,) whether status and distance allow its use in a pose.
     bound_ns : (N,) of the timestamp error; NaN if unknown.
-    delay_s : (N,) from the measurement to its arrival at the master.
+    delay_s : (N,) from the measurement to its arrival at the master; NaN if unknown.
     statuses : Number of measurements by status.
     distance_m : Minimum and maximum; NaN without distances.
     """
@@ -52,7 +52,7 @@ class StationStatistics:
     rate_hz : Usable measurements per second, from the first to the last; NaN with fewer than two.
     longest_gap_s : Longest time without a usable measurement, including start and end of the recording.
     gaps, in_gaps : Number of gaps longer than the outage limit, and their share of the recording.
-    delay_median_s, delay_p95_s : From the measurement to its arrival at the master.
+    delay_median_s, delay_p95_s : From the measurement to its arrival at the master; unknown if imported.
     distance_min_m, distance_max_m : Slope distances.
     """
 
@@ -88,10 +88,16 @@ def _record(station: int, measurements: Sequence[Measurement]) -> StationRecord:
         stamp_ns=np.array([m.stamp_ns for m in measurements], dtype=np.int64),
         usable=np.array([usable(m) for m in measurements], dtype=np.bool_),
         bound_ns=np.array([np.nan if bound is None else bound for bound in bounds], dtype=np.float64),
-        delay_s=np.array([m.received_ns - m.stamp_ns for m in measurements], dtype=np.int64) / 1e9,
+        delay_s=_delays_s(measurements),
         statuses=dict(Counter(m.status.value for m in measurements).most_common()),
         distance_m=(min(distances), max(distances)) if distances else (np.nan, np.nan),
     )
+
+
+def _delays_s(measurements: Sequence[Measurement]) -> FloatArray:
+    delay_ns = np.array([m.received_ns - m.stamp_ns for m in measurements], dtype=np.int64)
+    # An import has no times of arrival, and sets them to those of the measurements.
+    return delay_ns / 1e9 if delay_ns.any() else np.full(len(delay_ns), np.nan)
 
 
 def station_statistics(

@@ -231,6 +231,8 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
 
 def _reference(f: Findings) -> Iterator[Verdict]:
     at = point_label(f.recording.parameters.reference_point)
+    poses = f.poses
+    shown = None if poses is None else Kind(poses.kind[0]).estimator
     for name, each in f.reference_errors.items():
         if not each.compared:
             yield Verdict(
@@ -240,6 +242,8 @@ def _reference(f: Findings) -> Iterator[Verdict]:
             )
             continue
         consistent = math.isfinite(each.nees.mean) and _NEES[0] <= each.nees.mean <= _NEES[1]
+        if consistent and name != shown:
+            continue
         yield Verdict(
             Level.GOOD if consistent else Level.CARE,
             f"The error of {name} against the reference is {each.position_rms_mm:.1f} mm at {at}, "

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from tsgt.analysis.evaluation import compare, compare_aligned, stationary_errors
+from tsgt.analysis.evaluation import compare, compare_aligned, error_details, stationary_errors
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import numbers, print_table
 from tsgt.errors import DegenerateGeometryError, InputFileError, RecordingError
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.evaluation import (
         Align,
         AlignedErrorStatistics,
+        PoseErrorDetails,
         PoseErrorStatistics,
         Reference,
         StationaryStatistics,
@@ -38,6 +39,7 @@ class Comparison:
     """Errors of one estimator's poses against a reference; ``aligned`` only if an alignment was requested."""
 
     unaligned: PoseErrorStatistics
+    details: PoseErrorDetails
     aligned: AlignedErrorStatistics | None
     stationary: StationaryStatistics
 
@@ -45,6 +47,7 @@ class Comparison:
         """Return the figures for ``--json``."""
         return {
             **dataclasses.asdict(self.unaligned),
+            **self.details.keys(),
             "stationary": dataclasses.asdict(self.stationary),
             **({} if self.aligned is None else {"aligned": dataclasses.asdict(self.aligned)}),
         }
@@ -95,6 +98,7 @@ def compare_estimators(
         return {
             name: Comparison(
                 unaligned=unaligned[name],
+                details=error_details(poses, reference),
                 aligned=None
                 if align is None or not unaligned[name].compared
                 else compare_aligned(poses, reference, centroid_m, align),

@@ -8,7 +8,17 @@ import click
 
 from tsgt.analysis.evaluation import distances_at_epochs, outliers, residual_statistics
 from tsgt.analysis.formats import read_stationary_intervals
-from tsgt.analysis.report import Findings, collect_findings, render_page, report_numbers, verdicts
+from tsgt.analysis.report import (
+    Findings,
+    Images,
+    collect_findings,
+    headline,
+    map_figure,
+    render_page,
+    report_numbers,
+    sections,
+    verdicts,
+)
 from tsgt.analysis.report.log import read_log
 from tsgt.analysis.report.motion import distance_error_series
 from tsgt.analysis.report.stations import station_records, station_statistics
@@ -136,22 +146,20 @@ def write_report(
     OutputFileError
         A file cannot be written.
     """
-    from tsgt.analysis.report import sections, summary_table
+    from tsgt.analysis.figures import palette_png
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        made = sections(findings)
-        plots = [plot for section in made for plot in section.plots]
+        made, path_map = sections(findings), map_figure(findings)
+        plots = [*filter(None, [path_map]), *(plot for section in made for plot in section.plots)]
         images = {}
         for number, plot in enumerate(plots, start=1):
             files = [folder / f"{plot.name}{suffix}" for suffix in (".png", ".pdf")]
             plot.write(files)
-            images[plot.name] = files[0].read_bytes()
+            images[plot.name] = Images(*map(palette_png, (files[0].read_bytes(), plot.narrow_png())))
             if on_progress is not None:
                 on_progress(number / len(plots))
-        text = render_page(
-            f"Report of {findings.path.name}", summary_table(findings), verdicts(findings), made, images
-        )
+        text = render_page(f"Report of {findings.path.name}", headline(findings), path_map, made, images)
         (folder / PAGE_NAME).write_text(text, encoding="utf-8")
         (folder / NUMBERS_NAME).write_text(json_text(report_numbers(findings)) + "\n", encoding="utf-8")
     except OSError as error:

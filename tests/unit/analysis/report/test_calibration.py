@@ -38,7 +38,7 @@ def test_each_target_has_a_row() -> None:
     (table,) = section.tables
     assert table.rows == (
         ("2", "4", "3.00", "5.00"),
-        ("2", "7", "4.00", "-"),
+        ("2", "7", "4.00", "unknown"),
         ("2", "9", "rejected", "60.00"),
     )
     assert section.text == (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -66,6 +67,22 @@ def test_alignment_agrees_with_evo(
         "Aligned (translation): remaining error, alignment, and the part of the error that it hides"
     )
     assert f"{aligned_title}; {at}" in text
+
+
+def test_every_table_of_errors_names_its_points(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """In its title and in each column of positions: the reference point, or the prisms' centroid."""
+    reference = tmp_path / "linear.tum"
+    assert tsgt("process", recording, "--estimator", "linear", "--output", reference).code == 0
+    arguments = ("--no-held-out", "--reference", reference, "--align", "rigid", "--point", "lidar=1,2,3")
+    text = tsgt("evaluate", recording, *arguments).out
+    titles, headers = zip(*(table.strip().splitlines()[:2] for table in text.split("\n\n")[-2:]), strict=True)
+    assert all("positions at lidar and at the prisms' centroid" in title for title in titles)
+    for header in headers:
+        columns = [column for column in re.split(r"  +", header) if " mm" in column and column != "shift mm"]
+        assert len(columns) >= 2
+        assert all(column.startswith(("lidar ", "centroid ")) for column in columns), header
+    verdict = next(line for line in text.splitlines() if "stated position sigma" in line)
+    assert "at lidar is" in verdict
 
 
 def test_reference_of_another_day_is_an_error(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:

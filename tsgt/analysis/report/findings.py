@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from tsgt.analysis.design import Perturbation, equivalent_noise, perturbation_study
+from tsgt.analysis.diagnosis import diagnose_smoothed
 from tsgt.analysis.evaluation import (
     compare,
     compare_aligned,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from tsgt.analysis.diagnosis import Diagnosis
     from tsgt.analysis.evaluation import (
         Align,
         AlignedErrorStatistics,
@@ -100,6 +102,7 @@ class Findings:
     reference_errors, error_details, aligned_errors, stationary_errors
         Against the reference by estimator: unaligned, by component and over distances, after an alignment, and mean poses of
         stationary intervals; positions at the reference point, most also at the prisms' centroid.
+    diagnosis : Causes of errors.
     problems : Reasons for missing content, as sentences, by its name.
     """
 
@@ -126,6 +129,7 @@ class Findings:
     stationary_errors: dict[Estimator, StationaryStatistics] = field(default_factory=dict)
     reference: Reference | None = None
     pose_noise: PoseNoise | None = None
+    diagnosis: Diagnosis | None = None
     problems: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -256,6 +260,12 @@ def collect_findings(
         stationary_errors=stationary,
         reference=reference,
         pose_noise=attempt("pose_noise", lambda: _pose_noise(recording, distances)),
+        diagnosis=None
+        if continuous is None
+        else attempt(
+            "diagnosis",
+            lambda: diagnose_smoothed(parameters, continuous, held_out=held_out, distances=distances),
+        ),
         problems=problems,
     )
 

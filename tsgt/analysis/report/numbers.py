@@ -57,6 +57,8 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
         found |= _distances(f.inter_prism)
     if f.distance_errors is not None:
         found["errors_by_motion_mm"] = _by_motion(f.distance_errors)
+    if f.diagnosis is not None:
+        found["diagnosis"] = f.diagnosis.numbers()
     if f.held_out is not None:
         found["held_out_mm"] = {
             name: {**dataclasses.asdict(each.statistics), "gaps": dataclasses.asdict(each.gaps)}

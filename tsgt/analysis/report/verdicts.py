@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.diagnosis import GEOMETRY, TARGETS
 from tsgt.analysis.report.findings import position_sigma_mm
 from tsgt.estimation import Kind, point_label
 
@@ -29,6 +30,7 @@ _RESIDUAL_STD = 1.5
 _NOISE_SCALE = (0.5, 2.0)
 _OUTLIERS = 0.01
 _MIN_RESIDUALS = 30
+_LARGE_EFFECT_MM = 10.0
 _NEES = (3.0, 12.0)
 
 
@@ -52,6 +54,7 @@ class Verdict:
 def verdicts(findings: Findings) -> list[Verdict]:
     """Return the verdicts, the worst first."""
     found = [
+        *_diagnosis(findings),
         *_poses(findings),
         *_stations(findings),
         *_times(findings),
@@ -61,6 +64,23 @@ def verdicts(findings: Findings) -> list[Verdict]:
     ]
     order = (Level.BAD, Level.CARE, Level.GOOD)
     return sorted(found, key=lambda verdict: order.index(verdict.level))
+
+
+def _diagnosis(f: Findings) -> Iterator[Verdict]:
+    if f.diagnosis is None:
+        return
+    for each in f.diagnosis.findings:
+        if each.cause == GEOMETRY or each.effect_mm >= _LARGE_EFFECT_MM:
+            level = Level.BAD
+        else:
+            level = Level.GOOD if each.effect_mm == 0 and each.cause != TARGETS else Level.CARE
+        deciding = each.deciding_measurement
+        yield Verdict(level, each.text, f"{each.repair} To decide: {deciding}." if deciding else each.repair)
+    if not f.diagnosis.findings:
+        yield Verdict(
+            Level.GOOD,
+            "The measurements agree with the set-up and with the stated noise; no cause of errors was found.",
+        )
 
 
 def _poses(f: Findings) -> Iterator[Verdict]:
@@ -163,7 +183,7 @@ def _distances(f: Findings) -> Iterator[Verdict]:
             f"{why}: errors of layout, frames and prism constants cannot be separated from timing errors.",
             "Stop for some seconds now and then.",
         )
-    for pair in f.inter_prism.static:
+    for pair in f.inter_prism.static if f.diagnosis is None else ():
         figures = pair.statistics()
         bias_mm = figures.mean - figures.reference
         if abs(bias_mm) > _STATIC_BIAS_MM:
@@ -178,7 +198,7 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         Level.GOOD if moving_mm <= _MOVING_MM else Level.CARE,
         f"The measured distances between the prisms differ from the prism layout by {moving_mm:.1f} mm on average.",
     )
-    if static:
+    if static and f.diagnosis is None:
         static_std_mm = float(np.mean([figures.std for figures in static]))
         std_mm = float(np.mean([figures.std for figures in moving]))
         if std_mm > _TIMING_SHARE * static_std_mm:
@@ -201,7 +221,9 @@ def _residuals(f: Findings) -> Iterator[Verdict]:
             "There are too few measurements to estimate motion prior and noise scale: both are those of the recording.",
             "Record longer than some seconds.",
         )
-    elif not _NOISE_SCALE[0] <= scale <= _NOISE_SCALE[1]:
+    if f.diagnosis is not None:
+        return
+    if f.continuous.motion.tuned and not _NOISE_SCALE[0] <= scale <= _NOISE_SCALE[1]:
         yield Verdict(
             Level.CARE,
             f"The noise of the measurements is {scale:.2g} times the stated noise of the instruments.",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from tsgt.analysis.diagnosis import diagnose_smoothed
 from tsgt.analysis.evaluation import held_out_errors, inter_prism, outliers, residual_statistics
 from tsgt.analysis.processing import process
 from tsgt.analysis.smoothing import smooth_recording
@@ -36,13 +37,20 @@ from tsgt.cli.recordings import (
     prisms_option,
 )
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import build_observations, build_tracks
+from tsgt.estimation import build_observations, build_tracks, point_label
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tsgt.analysis.evaluation import Align, HeldOutErrors, Outlier, PairDistances
+    from tsgt.analysis.diagnosis import Diagnosis
+    from tsgt.analysis.evaluation import (
+        Align,
+        HeldOutErrors,
+        InterPrismDistances,
+        Outlier,
+        PairDistances,
+    )
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.cli.desk.reference import Comparison
@@ -112,7 +120,7 @@ def evaluate(
 
     Prints a verdict, then internal consistency (distances between prisms, which are constant on a rigid robot;
     residuals against the stated noise), held-out prediction errors, and errors against a reference. Errors and sigmas of
-    positions are those of the robot's origin, or of --point, and of the centroid of the prisms.
+    positions are at the robot's origin, or at --point; those at the centroid of the prisms stand beside them.
     """
     if odometry is not None and report_folder is None:
         raise click.UsageError("--odometry needs --report")
@@ -149,6 +157,7 @@ def evaluate(
     predicted = _held_out(loaded, continuous, recording) if with_held_out is not False else None
     rejected = outliers(continuous.fit, continuous.sources)
     residuals = residual_statistics(continuous.fit, continuous.sources)
+    diagnosis = _diagnosis(loaded, continuous, predicted, found)
     compared: dict[Estimator, Comparison] = {}
     if reference is not None and reference_path is not None:
         paths = (recording, reference_path)
@@ -168,6 +177,7 @@ def evaluate(
                 "inter_prism_mm": _figures(found.dynamic),
                 "still_s": found.stationary_s,
                 "inter_prism_static_mm": _figures(found.static),
+                **({} if diagnosis is None else {"diagnosis": diagnosis.numbers()}),
                 **({} if predicted is None else {"held_out_mm": _held_out_keys(predicted)}),
                 **motion_keys(continuous),
                 "residuals": {
@@ -183,7 +193,7 @@ def evaluate(
         )
         return
     errors = {name: each.unaligned for name, each in compared.items()}
-    print_verdicts(assess(loaded, recording, continuous, found, errors))
+    print_verdicts(assess(loaded, recording, continuous, found, errors, diagnosis))
     click.echo(f"\n{pose_summary(poses)} over {duration_s(poses):.1f} s")
     valid = found.epochs - found.invalid_epochs
     click.echo(
@@ -207,7 +217,21 @@ def evaluate(
     print_table(["station", "n", "mean", "std", "beyond 3"], rows)
     _print_outliers(rejected)
     if compared and reference_path is not None:
-        print_comparisons(compared, reference_path, alignment, parameters.reference_point)
+        print_comparisons(compared, reference_path, alignment, point_label(parameters.reference_point))
+
+
+def _diagnosis(
+    loaded: Recording,
+    continuous: SmoothedRecording,
+    predicted: dict[Estimator, HeldOutErrors] | None,
+    distances: InterPrismDistances,
+) -> Diagnosis | None:
+    """Diagnose; None for too few measurements."""
+    try:
+        with progress("looking for causes of errors"):
+            return diagnose_smoothed(loaded.parameters, continuous, held_out=predicted, distances=distances)
+    except GeometryError:
+        return None
 
 
 def _held_out(loaded: Recording, continuous: SmoothedRecording, path: Path) -> dict[Estimator, HeldOutErrors]:

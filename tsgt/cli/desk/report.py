@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from tsgt.analysis.diagnosis import Diagnosis
     from tsgt.analysis.evaluation import Align, InterPrismDistances, PoseErrorStatistics, Reference
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.verdicts import Verdict
@@ -51,6 +52,7 @@ def assess(
     continuous: SmoothedRecording,
     distances: InterPrismDistances,
     compared: dict[Estimator, PoseErrorStatistics],
+    diagnosis: Diagnosis | None,
 ) -> list[Verdict]:
     """Return the verdicts on an evaluated recording, without what only a report computes."""
     parameters = recording.parameters
@@ -77,6 +79,7 @@ def assess(
         residuals=residual_statistics(continuous.fit, continuous.sources),
         outliers=outliers(continuous.fit, continuous.sources),
         reference_errors=compared,
+        diagnosis=diagnosis,
     )
     return verdicts(findings)
 

@@ -15,7 +15,12 @@ from tsgt.geometry.trajectory.gauss_newton import (
 )
 from tsgt.geometry.trajectory.hyperparameters import NOISE_FLOOR_SHARE, tune, with_noise_floor
 from tsgt.geometry.trajectory.initialisation import initial_guess
-from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations, linearise
+from tsgt.geometry.trajectory.measurement_factors import (
+    LinearisedMeasurements,
+    Observations,
+    line_of_sight_axes,
+    linearise,
+)
 from tsgt.geometry.trajectory.noise_scales import overall_scale, scale_noise
 from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
 from tsgt.geometry.trajectory.rest import RestInterval, in_rest
@@ -42,6 +47,7 @@ __all__ = [
     "in_rest",
     "initial_guess",
     "knot_times",
+    "line_of_sight_axes",
     "linearise",
     "nearest_knots",
     "overall_scale",

@@ -26,12 +26,14 @@ COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
 class PoseComponents:
     """Six components at N epochs: x, y, z of the poses' point in frame ``station1`` (m); roll, pitch, yaw (rad).
 
-    ``value``, (N, 6), are the poses or their errors; ``sigma``, (N, 6), what the poses state about them. NaN where unknown.
+    ``value``, (N, 6), are the poses or their errors; ``sigma``, (N, 6), what the poses state about them, of which
+    ``sigma_common``, (N, 6), is the part that all poses share. NaN where unknown.
     """
 
     stamp_ns: NDArray[np.int64]
     value: FloatArray
     sigma: FloatArray
+    sigma_common: FloatArray
 
     @property
     def within_two_sigma(self) -> FloatArray:
@@ -55,8 +57,8 @@ def pose_components(poses: PoseBatch) -> PoseComponents:
     valid = poses.valid[:, None]
     R = rotation_from_quaternion(np.where(valid, poses.orientation_xyzw, [0.0, 0.0, 0.0, 1.0]))
     value = np.concatenate([poses.position_m, euler_angles_rad(R)], axis=1)
-    sigma = component_sigmas(R, poses.covariance)
-    return PoseComponents(poses.stamp_ns, np.where(valid, value, np.nan), np.where(valid, sigma, np.nan))
+    columns = (value, component_sigmas(R, poses.covariance), component_sigmas(R, poses.covariance_common))
+    return PoseComponents(poses.stamp_ns, *(np.where(valid, column, np.nan) for column in columns))
 
 
 def error_components(poses: PoseBatch, reference: Reference) -> PoseComponents:
@@ -66,14 +68,16 @@ def error_components(poses: PoseBatch, reference: Reference) -> PoseComponents:
     angles = euler_angles_rad(R) - euler_angles_rad(true[:, :3, :3])
     turn = (angles + np.pi) % (2 * np.pi) - np.pi
     value = np.concatenate([poses.position_m[rows] - true[:, :3, 3], turn], axis=1)
-    return PoseComponents(poses.stamp_ns[rows], value, component_sigmas(R, poses.covariance[rows]))
+    sigmas = (component_sigmas(R, each[rows]) for each in (poses.covariance, poses.covariance_common))
+    return PoseComponents(poses.stamp_ns[rows], value, *sigmas)
 
 
 def component_sigmas(R: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the sigmas of the six components, (N, 6), of poses with rotations R, (N, 3, 3), and covariances (N, 6, 6)."""
     rotation = euler_covariance(R, covariance[:, 3:, 3:])
     variances = [np.einsum("nii->ni", block) for block in (covariance[:, :3, :3], rotation)]
-    return np.asarray(np.sqrt(np.concatenate(variances, axis=1)))
+    # A variance that should be 0 may be less by rounding.
+    return np.asarray(np.sqrt(np.maximum(np.concatenate(variances, axis=1), 0.0)))
 
 
 @dataclass(frozen=True, slots=True)

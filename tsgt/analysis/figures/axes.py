@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures.style import STROKES
+from tsgt.analysis.figures.style import PAGE_WIDTH_MM, STROKES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -159,5 +159,10 @@ def legend_above(figure: Figure, axes: Sequence[Axes]) -> None:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             handles.setdefault(str(label), handle)
     if handles:
-        columns = min(len(handles), 6)
+        columns = min(len(handles), 2 if narrow(figure) else 6)
         figure.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=columns)
+
+
+def narrow(figure: Figure) -> bool:
+    """Return whether a figure is as wide as a column of text, not as a page."""
+    return figure.get_figwidth() * 25.4 < 0.7 * PAGE_WIDTH_MM

@@ -34,14 +34,26 @@ def draw_components(figure: Figure, poses: PoseComponents, axis: TimeAxis) -> No
         _band(left, time, value, 2 * (sigma if row < 3 else np.degrees(sigma)))
         curve(left, time, value, 0, label="pose", dashes=False)
         left.set_ylabel(f"{name} ({'m' if row < 3 else 'deg'})")
-        x, most = envelope(time, _small_unit(row) * sigma)
-        right.plot(x, most, color=stroke(1).color, linewidth=0.9, label="sigma")
+        for number, (part, label) in enumerate(
+            ((sigma, "whole standard deviation"), (poses.sigma_common[:, row], "part common to all poses"))
+        ):
+            if np.isfinite(part).any():
+                x, most = envelope(time, _small_unit(row) * part)
+                look = stroke(number + 1)
+                right.plot(
+                    x,
+                    most,
+                    color=look.color,
+                    linestyle="-" if not number else "--",
+                    linewidth=0.9,
+                    label=label,
+                )
         plain_log(right.yaxis)
         right.set_ylabel("mm" if row < 3 else "deg")
     axes[0, 0].set_title("pose")
-    axes[0, 1].set_title("its standard deviation (1 sigma)")
-    for panel in axes[-1]:
-        panel.set_xlabel(axis.label)
+    axes[0, 1].set_title("standard deviation")
+    figure.supxlabel(axis.label, fontsize=8)
+    legend_above(figure, axes[0])
     figure.align_ylabels(axes[:, 0])
     figure.align_ylabels(axes[:, 1])
 
@@ -57,7 +69,13 @@ def draw_component_errors(figure: Figure, errors: PoseComponents, axis: TimeAxis
         value = np.insert(scale * errors.value[:, row], breaks, np.nan)
         sigma = np.insert(scale * errors.sigma[:, row], breaks, np.nan)
         x, most = envelope(time, 2 * sigma)
-        panel.fill_between(x, -most, most, color=_BAND, linewidth=0, label="2 stated sigmas")
+        panel.fill_between(x, -most, most, color=_BAND, linewidth=0, label="2 stated standard deviations")
+        common = np.insert(scale * errors.sigma_common[:, row], breaks, np.nan)
+        if np.isfinite(common).any():
+            x, most = envelope(time, 2 * common)
+            for side in (-1, 1):
+                label = "their part common to all poses" if side > 0 else None
+                panel.plot(x, side * most, color="#404040", linestyle="--", linewidth=0.8, label=label)
         curve(panel, time, value, 0, label="error", dashes=False)
         panel.axhline(0.0, color="black", linewidth=0.5)
         unit, digits = ("mm", 1) if row < 3 else ("deg", 3)
@@ -84,7 +102,7 @@ def _small_unit(row: int) -> float:
 def _band(panel: Axes, time: FloatArray, value: FloatArray, half_width: FloatArray) -> None:
     step = max(1, len(time) // 1500)
     low, high = (value - half_width)[::step], (value + half_width)[::step]
-    panel.fill_between(time[::step], low, high, color=_BAND, linewidth=0, label="2 sigma")
+    panel.fill_between(time[::step], low, high, color=_BAND, linewidth=0, label="2 standard deviations")
 
 
 def _breaks(stamp_ns: np.ndarray) -> np.ndarray:

@@ -307,13 +307,11 @@ def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> 
     )
 
 
-def position_sigma_mm(poses: PoseBatch) -> FloatArray:
-    """Return the stated position sigma per axis (root mean square of the three) of each valid pose, at its own point."""
-    covariance = poses.covariance[poses.valid, :3, :3]
-    return np.asarray(1e3 * np.sqrt(np.einsum("nii->n", covariance) / 3))
+def position_sigma_mm(covariance: FloatArray) -> FloatArray:
+    """Return the position sigma per axis (root mean square of the three), (N,), of covariances, (N, 6, 6)."""
+    return np.asarray(1e3 * np.sqrt(np.einsum("nii->n", covariance[:, :3, :3]) / 3))
 
 
-def rotation_sigma_deg(poses: PoseBatch) -> FloatArray:
-    """Return the stated rotation sigma per axis (root mean square of the three) of each valid pose."""
-    covariance = poses.covariance[poses.valid, 3:, 3:]
-    return np.asarray(np.degrees(np.sqrt(np.einsum("nii->n", covariance) / 3)))
+def rotation_sigma_deg(covariance: FloatArray) -> FloatArray:
+    """Return the rotation sigma per axis (root mean square of the three), (N,), of covariances, (N, 6, 6)."""
+    return np.asarray(np.degrees(np.sqrt(np.einsum("nii->n", covariance[:, 3:, 3:]) / 3)))

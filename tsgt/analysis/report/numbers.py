@@ -117,15 +117,26 @@ def difference_numbers(difference: Difference) -> dict[str, Any]:
 
 
 def pose_numbers(poses: PoseBatch, parameters: Parameters) -> dict[str, Any]:
-    """Count an estimator's poses, and summarise the stated sigmas of the valid ones, at their point and at the centroid."""
-    at_centroid = poses_at(poses, centroid_point(parameters))
+    """Count an estimator's poses, and summarise the stated sigmas of the valid ones, at their point and at the centroid.
+
+    ``common``: of the part of the covariance that all poses share; NaN if unknown.
+    """
+    valid = poses.select(poses.valid)
+    at_centroid = poses_at(valid, centroid_point(parameters))
     return {
         "poses": len(poses),
-        "valid_poses": int(np.count_nonzero(poses.valid)),
+        "valid_poses": len(valid),
         "invalid": poses.invalid_counts(),
-        "position_sigma_mm": median_and_p95(position_sigma_mm(poses)),
-        "rotation_sigma_deg": median_and_p95(rotation_sigma_deg(poses)),
-        "centroid": {"position_sigma_mm": median_and_p95(position_sigma_mm(at_centroid))},
+        **_sigmas(valid.covariance),
+        "common": _sigmas(valid.covariance_common),
+        "centroid": {"position_sigma_mm": _sigmas(at_centroid.covariance)["position_sigma_mm"]},
+    }
+
+
+def _sigmas(covariance: FloatArray) -> dict[str, dict[str, float]]:
+    return {
+        "position_sigma_mm": median_and_p95(position_sigma_mm(covariance)),
+        "rotation_sigma_deg": median_and_p95(rotation_sigma_deg(covariance)),
     }
 
 

@@ -62,9 +62,7 @@ def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray
 def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -> None:
     """Draw the cumulative distribution of the held-out prediction errors of each estimator."""
     axes = figure.subplots(1, 2, sharey=True)
-    for panel, gap, title in zip(
-        axes, (False, True), ("neighbours at most 1 s apart", "at gaps over 1 s"), strict=True
-    ):
+    for panel, gap, title in zip(axes, (False, True), ("gaps up to 1 s", "gaps over 1 s"), strict=True):
         reach_mm = 0.0
         for row, (name, each) in enumerate(held_out.items()):
             chosen = np.sort(1e3 * each.error_m[each.at_gap == gap])
@@ -144,10 +142,10 @@ def draw_perturbation(figure: Figure, study: Sequence[Perturbation], measured_m:
             )
         panel.axvline(1e3 * measured_m, color="black", linestyle=":", linewidth=0.8)
         panel.set_ylabel(label)
-        panel.set_xlabel("noise per coordinate (mm)")
         panel.set_xlim(0.0, noise_mm[-1])
         panel.set_ylim(bottom=0.0)
         panel.legend(loc="upper left")
+    figure.supxlabel("noise of each prism coordinate, 1 sigma (mm)", fontsize=8)
 
 
 def _with_gaps(difference: Difference) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:

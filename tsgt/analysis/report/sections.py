@@ -242,7 +242,7 @@ def _by_motion(f: Findings) -> Section:
         return Section(title, ("Unknown: requires the distances between all prisms, and poses.",))
     error_m = np.array(list(errors.error_m.values()))
     motion = errors.motion
-    names = ("speed (m/s)", "acceleration (m/s²)", "angular rate (rad/s)")
+    names = ("speed\n(m/s)", "acceleration\n(m/s²)", "angular rate\n(rad/s)")
     values = (motion.speed_mps, motion.acceleration_mps2, motion.angular_rate_radps)
     bins = [(name, binned(error_m, value)) for name, value in zip(names, values, strict=True)]
     if all(found is None for _, found in bins):

@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import curve, dots, hatch, legend_above, note, plain_log, shade, stroke
+from tsgt.analysis.figures import (
+    curve,
+    dots,
+    hatch,
+    legend_above,
+    narrow,
+    note,
+    plain_log,
+    shade,
+    stroke,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -146,7 +156,7 @@ def draw_histograms(figure: Figure, found: InterPrismDistances) -> None:
             _histogram(axes[row, column], pair, reach_mm, row)
             if column == 0:
                 axes[row, column].set_ylabel(f"{name}\nshare (%)")
-        axes[0, column].set_title(f"prisms {static.name}, layout {1e3 * static.reference_m:.1f} mm")
+        axes[0, column].set_title(f"prisms {static.name}\nlayout {1e3 * static.reference_m:.1f} mm")
     figure.supxlabel("measured distance minus that of the layout (mm)", fontsize=8)
     legend_above(figure, list(axes.ravel()))
 
@@ -167,16 +177,6 @@ def _histogram(panel: Axes, pair: PairDistances, reach_mm: float, row: int) -> N
         linewidth=0.3,
     )
     panel.axvline(float(error_mm.mean()), color="#D55E00", linestyle="--", linewidth=1.2, label="mean")
-    panel.text(
-        0.98,
-        0.95,
-        f"mean {error_mm.mean():+.1f}\nstd {error_mm.std():.1f}\nn {len(error_mm)}",
-        transform=panel.transAxes,
-        ha="right",
-        va="top",
-        fontsize=6,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
-    )
 
 
 def draw_distance_errors(
@@ -241,7 +241,7 @@ def draw_bins(figure: Figure, bins: Sequence[tuple[str, Bins | None]]) -> None:
             linewidth=0.4,
         )
         below.set_yscale("log")
-        below.locator_params(axis="x", nbins=5)
+        below.locator_params(axis="x", nbins=4)
     axes[0, 0].set_ylim(bottom=0.0)
     # From 1, so that the heights of bars can be compared; last, since it fixes the upper limit.
     axes[1, 0].set_ylim(bottom=1.0)
@@ -261,7 +261,7 @@ def draw_grids(figure: Figure, grids: Sequence[tuple[str, str, Grid]]) -> None:
             grid.x_edges, grid.y_edges, np.ma.masked_invalid(mean_mm), cmap="cividis", vmin=0.0, vmax=top
         )
         panel.grid(visible=False)
-        for i, j in np.argwhere(np.isfinite(mean_mm)):
+        for i, j in () if narrow(figure) else np.argwhere(np.isfinite(mean_mm)):
             panel.text(
                 grid.x_edges[j : j + 2].mean(),
                 grid.y_edges[i : i + 2].mean(),

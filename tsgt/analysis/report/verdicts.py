@@ -102,12 +102,21 @@ def _poses(f: Findings) -> Iterator[Verdict]:
         f"{f' (not valid: {why})' if why else ''}.",
         "" if share == 1.0 else "Use valid poses only.",
     )
-    sigma_mm = position_sigma_mm(poses)
+    if not poses.valid.any():
+        return
+    sigma_mm, common_mm = (
+        position_sigma_mm(each[poses.valid]) for each in (poses.covariance, poses.covariance_common)
+    )
+    known = np.isfinite(common_mm)
     yield Verdict(
         Level.GOOD if np.median(sigma_mm) <= _SIGMA_MM else Level.CARE,
         f"The stated position sigma of the valid poses per axis at {point_label(poses.reference_point)} is "
-        f"{np.median(sigma_mm):.1f} mm (median) and {np.percentile(sigma_mm, 95):.1f} mm (95 %); it does not include errors common to all prisms, such as "
-        "those of a station frame.",
+        f"{np.median(sigma_mm):.1f} mm (median) and {np.percentile(sigma_mm, 95):.1f} mm (95 %)"
+        + (
+            f"; {np.median(common_mm[known]):.1f} mm of it (median) are common to all poses and do not average out."
+            if known.any()
+            else "; it does not include errors common to all poses, such as those of a station frame, which are unknown."
+        ),
     )
 
 

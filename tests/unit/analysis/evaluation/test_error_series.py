@@ -24,6 +24,7 @@ def poses_with(errors: np.ndarray) -> tuple[PoseBatch, Reference]:
     angles = errors[:, 3:] + np.stack([level, level, YAW], axis=1)
     batch.orientation_xyzw[:] = Rotation.from_euler("xyz", angles).as_quat()
     batch.covariance[:] = np.diag([1.0, 4.0, 9.0, 1.0, 4.0, 9.0]) * 1e-6
+    batch.covariance_common[:] = 0.25 * batch.covariance
     return batch, truth
 
 
@@ -34,6 +35,7 @@ def test_each_component_has_its_error_and_sigma() -> None:
     np.testing.assert_allclose(found.value, given[: len(found.value)], atol=1e-9)
     np.testing.assert_allclose(found.rms, np.abs(given[0]), atol=1e-9)
     np.testing.assert_allclose(found.sigma[:, :3], np.tile([0.001, 0.002, 0.003], (len(found.value), 1)))
+    np.testing.assert_allclose(found.sigma_common, 0.5 * found.sigma)
     # Sigmas of roll and pitch are about the robot's heading: here nearly minus x, so nearly those about x and y.
     np.testing.assert_allclose(found.sigma[0, 3:], [0.001, 0.002, 0.003], rtol=0.1)
 

@@ -145,7 +145,9 @@ def test_page_is_accessible(made: Made) -> None:
     alternatives = re.findall(r'<img alt="([^"]*)"', page)
     assert len(set(alternatives)) == len(FIGURES)
     assert all(" " in text for text in alternatives)
-    assert page.count("<table>") == page.count('<div class="scroll" role="region" tabindex="0"')
+    assert page.count("<table aria-labelledby") == page.count(
+        '<div class="scroll" role="region" tabindex="0"'
+    )
 
 
 def test_page_names_what_is_unknown(made: Made) -> None:

@@ -109,7 +109,9 @@ def evaluate(name: str, recording: Recording, world: World, start_ns: int, end_n
 def main() -> None:
     """Print a table."""
     configure_logging("error")
-    print("| drive | motion | NEES, mean | largest | above 22.5 in 1000 | above 60 in 1000 | rms | valid |")
+    print(
+        "| drive | motion | NEES, mean | largest | above 22.5 in 1000 | above 60 in 1000 | rms at the prisms' centroid | valid |"
+    )
     for each in sys.argv[1:] or DRIVES:
         name, _, seed = each.partition(":")
         drive(name, int(seed))

@@ -118,6 +118,7 @@ def main() -> None:
             shares = ", ".join(f"{np.mean(nees > limit):.1e} above {limit}" for limit in LIMITS)
             rms_mm = 1e3 * np.sqrt(squares.mean())
             print(
-                f"  {name}: {rms_mm:.2f} mm rms, mean {nees.mean():.2f}, {shares}, largest {nees.max():.0f}",
+                f"  {name}: {rms_mm:.2f} mm rms at the robot's origin, NEES: mean {nees.mean():.2f}, {shares}, "
+                f"largest {nees.max():.0f}",
                 flush=True,
             )

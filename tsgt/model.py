@@ -389,7 +389,7 @@ class PipelineParameters(FiniteNumbers):
     rotation_sigma_limit_rad: float = math.radians(2.0)
     """The same for the sigma of its rotation. For ``continuous``."""
     predicted_position_sigma_limit_m: float = 0.15
-    """As ``position_sigma_limit_m``, for predicted poses."""
+    """As ``position_sigma_limit_m``, at the reference point, for predicted poses."""
     predicted_rotation_sigma_limit_rad: float = math.radians(5.0)
     """The same for the sigma of their rotation."""
 

@@ -2,7 +2,8 @@
 
 With ``T_a_b`` from the new frame b on the robot to the old one a, and its lever arm l in a: p' = p + R l, R' = R R_a_b,
 v' = v + R (ω x l), and ω' has the axes of b. A rotation error θ about fixed axes displaces the point by θ x R l, to first
-order; the second-order part of a covariance is that of the point (:func:`tsgt.geometry.trajectory.with_second_order_terms`).
+order; the second-order part of a covariance is that of the point (:func:`tsgt.geometry.trajectory.with_second_order_terms`); the
+common part has none.
 """
 
 from __future__ import annotations
@@ -76,13 +77,15 @@ def poses_at(batch: PoseBatch, point: ReferencePoint) -> PoseBatch:
     rows = np.flatnonzero(np.isfinite(batch.position_m[:, 0]))
     if not len(rows) or np.array_equal(T, np.eye(4)):
         return dataclasses.replace(batch, reference_point=point)
-    names = ("position_m", "orientation_xyzw", "velocity_mps", "angular_velocity_radps", "covariance")
-    moved = {name: getattr(batch, name).copy() for name in names}
-    arm_m, motion = _motion_at(T, *(moved[name][rows] for name in names[:-1]))
-    for name, values in zip(names, motion, strict=False):
-        moved[name][rows] = values
+    names = ("position_m", "orientation_xyzw", "velocity_mps", "angular_velocity_radps")
+    arm_m, motion = _motion_at(T, *(getattr(batch, name)[rows] for name in names))
+    found = dict(zip(names, motion, strict=True))
     continuous = batch.kind[rows] != Kind.INTERPOLATED
-    moved["covariance"][rows] = _covariance_at(batch.covariance[rows], arm_m, continuous)
+    found["covariance"] = _covariance_at(batch.covariance[rows], arm_m, continuous)
+    found["covariance_common"] = _first_order_at(batch.covariance_common[rows], arm_m)
+    moved = {name: getattr(batch, name).copy() for name in found}
+    for name, values in found.items():
+        moved[name][rows] = values
     return dataclasses.replace(batch, reference_point=point, **moved)
 
 
@@ -109,10 +112,8 @@ def _some_records_at(records: tuple[PoseRecord, ...], T: FloatArray, name: str) 
     arm_m, motion = _motion_at(T, *np.split(numbers, (3, 7, 10), axis=1))
     continuous = np.array([record.estimator == "continuous" for record in records])
     full = _recorded_covariance_at([record.covariance for record in records], arm_m, continuous)
-    # The common part is of first order: the curvature of an uncertain rotation is in the full covariance.
-    common = _recorded_covariance_at(
-        [record.covariance_common for record in records], arm_m, np.zeros_like(continuous)
-    )
+    commons = [record.covariance_common for record in records]
+    common = _recorded_covariance_at(commons, arm_m, np.zeros_like(continuous))
     for record, *moved, covariance, covariance_common in zip(
         records, *(values.tolist() for values in motion), full, common, strict=True
     ):
@@ -151,11 +152,17 @@ def _covariance_at(covariance: FloatArray, arm_m: FloatArray, second_order: NDAr
 
     ``second_order``: (N,) whether they contain second-order terms, which depend on the point.
     """
+    first_order = covariance.copy()
+    first_order[second_order] -= _second_order(covariance[second_order])
+    moved = _first_order_at(first_order, arm_m)
+    moved[second_order] += _second_order(moved[second_order])
+    return moved
+
+
+def _first_order_at(covariance: FloatArray, arm_m: FloatArray) -> FloatArray:
     by_error = np.tile(np.eye(6), (len(arm_m), 1, 1))
     by_error[:, :3, 3:] = -skew(arm_m)
-    first_order = np.where(second_order[:, None, None], covariance - _second_order(covariance), covariance)
-    moved = by_error @ first_order @ np.swapaxes(by_error, 1, 2)
-    moved = np.where(second_order[:, None, None], moved + _second_order(moved), moved)
+    moved = by_error @ covariance @ np.swapaxes(by_error, 1, 2)
     return np.asarray(0.5 * (moved + np.swapaxes(moved, 1, 2)))
 
 

@@ -56,11 +56,11 @@ class ValidityLimits(FiniteNumbers):
     reference_point: str
     """Name of the point whose position is judged: ``child_frame`` of the poses."""
     position_sigma_m: float | None
-    """Limit of the position's sigma in its least certain direction, in m; null: none, with the estimator linear."""
+    """Limit of the sigma of the reference point's position in its least certain direction, in m; null: none, with the estimator linear."""
     rotation_sigma_rad: float | None
     """The same for the rotation, in rad."""
     predicted_position_sigma_m: float | None
-    """Limit of the position's sigma of predicted poses, in m; null: none are sent."""
+    """The same of predicted poses, in m, at the reference point; null: none are sent."""
     predicted_rotation_sigma_rad: float | None
     """The same for the rotation, in rad."""
     residual_m: float

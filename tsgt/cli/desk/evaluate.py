@@ -37,7 +37,7 @@ from tsgt.cli.recordings import (
     prisms_option,
 )
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import build_observations, build_tracks, point_label
+from tsgt.estimation import build_observations, build_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -120,7 +120,7 @@ def evaluate(
 
     Prints a verdict, then internal consistency (distances between prisms, which are constant on a rigid robot;
     residuals against the stated noise), held-out prediction errors, and errors against a reference. Errors and sigmas of
-    positions are at the robot's origin, or at --point; those at the centroid of the prisms stand beside them.
+    positions are those of the robot's origin, or of --point, and of the centroid of the prisms.
     """
     if odometry is not None and report_folder is None:
         raise click.UsageError("--odometry needs --report")
@@ -217,7 +217,7 @@ def evaluate(
     print_table(["station", "n", "mean", "std", "beyond 3"], rows)
     _print_outliers(rejected)
     if compared and reference_path is not None:
-        print_comparisons(compared, reference_path, alignment, point_label(parameters.reference_point))
+        print_comparisons(compared, reference_path, alignment, parameters.reference_point)
 
 
 def _diagnosis(

@@ -15,7 +15,7 @@ from tsgt.analysis.evaluation import compare, compare_aligned, error_details, st
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.cli.output import numbers, print_table
 from tsgt.errors import DegenerateGeometryError, InputFileError, RecordingError
-from tsgt.estimation import PoseBatch, centroid_at_point
+from tsgt.estimation import PoseBatch, centroid_at_point, point_label
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     )
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import SmoothedRecording
+    from tsgt.model import ReferencePoint
     from tsgt.recording import Recording
 
 
@@ -115,12 +116,15 @@ def compare_estimators(
 
 
 def print_comparisons(
-    found: dict[Estimator, Comparison], reference_path: Path, align: Align | None, point: str
+    found: dict[Estimator, Comparison], reference_path: Path, align: Align | None, point: ReferencePoint
 ) -> None:
-    """Print the errors as tables; ``point``: name of the reference point."""
-    click.echo(
-        f"\nErrors against {reference_path}, unaligned, positions at {point} (beside it: the prisms' centroid)"
-    )
+    """Print the errors as tables, positions at the reference point and at the prisms' centroid."""
+    at = f"positions at {point_label(point)} and at the prisms' centroid"
+    click.echo(f"\nErrors against {reference_path}, unaligned; {at}")
+
+    def of_points(*figures: str) -> list[str]:
+        return [f"{name} {each} mm" for name in (point.name, "centroid") for each in figures]
+
     rows = [
         [
             name,
@@ -132,7 +136,7 @@ def print_comparisons(
         for name, each in found.items()
         for f in (each.unaligned,)
     ]
-    print_table(["estimator", "n", "rms mm", "centroid mm", "rms deg", "NEES (6)", "max", "above 95 %"], rows)
+    print_table(["estimator", "n", *of_points("rms"), "rms deg", "NEES (6)", "max", "above 95 %"], rows)
     rows = [
         [
             f"{name}, aligned",
@@ -146,10 +150,10 @@ def print_comparisons(
     ]
     if rows:
         click.echo(
-            f"\nAligned ({align}): remaining error, alignment, and the part of the error that it hides; at {point}"
+            f"\nAligned ({align}): remaining error, alignment, and the part of the error that it hides; {at}"
         )
-        header = ["rms mm", "centroid mm", "rms deg", "shift mm", "rotation deg", "hidden mm", "hidden deg"]
-        print_table(["estimator", *header], rows)
+        header = [*of_points("rms"), "rms deg", "shift mm", "rotation deg"]
+        print_table(["estimator", *header, f"{point.name} hidden mm", "hidden deg"], rows)
     rows = [
         [
             f"{name}, stops",
@@ -163,9 +167,8 @@ def print_comparisons(
         if s.stops
     ]
     if rows:
-        click.echo(f"\nMean pose of each stop, unaligned: mean and maximum error at {point}")
-        header = ["n", "mean mm", "max mm", "centroid: mean mm", "max mm", "mean deg", "max deg"]
-        print_table(["estimator", *header], rows)
+        click.echo(f"\nMean pose of each stop, unaligned: mean and maximum error; {at}")
+        print_table(["estimator", "n", *of_points("mean", "max"), "mean deg", "max deg"], rows)
 
 
 def _span(stamp_ns: np.ndarray[Any, np.dtype[np.int64]]) -> str:

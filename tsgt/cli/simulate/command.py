@@ -346,8 +346,8 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
             f"{outage['start_s']:g} s: backlog drained after {_number(outage['drained_s'], 1)} s; median age of live "
             f"measurements meanwhile {_number(outage['live_age_ms']['p50'], 0)} ms"
         )
-    at = point_label(ReferencePoint(**result["reference_point"]))
-    click.echo(f"\nPose errors, positions at {at} (beside it: the prisms' centroid)")
+    point = ReferencePoint(**result["reference_point"])
+    click.echo(f"\nPose errors, positions at {point_label(point)} and at the prisms' centroid")
     rows = [
         [
             name,
@@ -364,7 +364,7 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
         }.items()
     ]
     header = [
-        *("", "poses", "valid", "rms mm", "centroid mm", "rms deg", "NEES (6)"),
+        *("", "poses", "valid", f"{point.name} rms mm", "centroid rms mm", "rms deg", "NEES (6)"),
         *("newest data, age ms: p50", "p99"),
     ]
     print_table(header, rows)

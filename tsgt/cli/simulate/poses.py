@@ -1,6 +1,6 @@
 """Pose errors of a simulated mission: of both estimators after processing, and of the live stream.
 
-Positions are compared at the reference point; errors at the prisms' centroid stand beside them.
+Positions are compared at the reference point and at the prisms' centroid.
 """
 
 from __future__ import annotations

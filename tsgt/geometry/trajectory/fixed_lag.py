@@ -34,6 +34,7 @@ from tsgt.geometry.trajectory.gauss_newton import (
 from tsgt.geometry.trajectory.initialisation import initial_guess
 from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
 from tsgt.geometry.trajectory.measurement_factors import Observations
+from tsgt.geometry.trajectory.prediction_errors import PredictionErrorMonitor
 from tsgt.geometry.trajectory.propagation import Propagator, acceleration_response
 from tsgt.geometry.trajectory.query import Trajectory
 from tsgt.geometry.trajectory.states import STATE_DIM, ProcessFactors, States, concatenate_states
@@ -70,6 +71,7 @@ robot rotating at 1 rad/s were up to 0.4 sigmas from those of a full search.
 
 MAX_INITIAL_ITERATIONS = 10  # Six at most if it converges; others are retried
 MIN_MEASUREMENTS_PER_PRISM, MAX_GAP_S = 3, 1.25  # Determine the trajectory without earlier ones
+MIN_PRISMS, MAX_AGE_S = 3, 1.0  # Prisms measured since then: errors of predictions are comparable
 PREDICTION_NOISE_SCALE = 2.0  # After minutes of steady motion a sudden manoeuvre may come
 PREDICTION_NIS_THRESHOLD = 4.0
 """NIS of the newest measurement above which the covariance of predictions is scaled up in proportion: a manoeuvre that has
@@ -103,6 +105,7 @@ class FixedLagSmoother:
         self._trajectory: Trajectory | None = None
         self._propagator: Propagator | None = None
         self._newest_nis = 0.0
+        self._prediction_errors = PredictionErrorMonitor()
         self.observations: Observations | None = None
         self.residuals_m: FloatArray = np.empty((0, 3))
 
@@ -166,6 +169,11 @@ class FixedLagSmoother:
         if self.observations is None:
             return
         if self._converged:
+            # Before the trajectory was reliable, or while it is not, its errors are not those of the ground.
+            self._prediction_errors.discard_before(min(self._reliable_from_s, before_s))
+            self._prediction_errors.compare_before(min(before_s, self.ambiguous_from_s), self.trajectory())
+        self._prediction_errors.discard_before(before_s)
+        if self._converged:
             try:
                 self._eliminate_before(before_s)
             except GeometryError:  # by rounding alone; the window suffices to reinitialise
@@ -210,14 +218,22 @@ class FixedLagSmoother:
     def predict(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all measurements so far, with its covariance as :meth:`Trajectory.at` does.
 
-        Beyond the last measurement :data:`PREDICTION_NOISE_SCALE` scales the process noise and the newest NIS the
-        covariance.
+        Beyond the last measurement :data:`PREDICTION_NOISE_SCALE` scales the process noise, the newest NIS the covariance
+        and, while three prisms are observed, the errors of earlier predictions that of each axis.
         """
         assert self._propagator is not None  # noqa: S101 (only called while initialised)
         if time_s >= self._propagator.time_s:
             state, covariance = self._propagator.at(time_s, dim=dim)
+            if self._converged and not self.ambiguous and self._observed_prisms(time_s) >= MIN_PRISMS:
+                self._prediction_errors.record(state, covariance)
+                covariance = self._prediction_errors.scaled(covariance)
             return state, covariance * max(1.0, self._newest_nis / PREDICTION_NIS_THRESHOLD)
         return self.trajectory().at(np.array([time_s]), dim=dim)
+
+    def _observed_prisms(self, time_s: float) -> int:
+        """Count the prisms measured shortly before a time."""
+        assert self.observations is not None  # noqa: S101 (converged)
+        return len(set(self.observations.prism[self.observations.time_s >= time_s - MAX_AGE_S].tolist()))
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory over the window and over what the last :meth:`marginalise_before` eliminated."""

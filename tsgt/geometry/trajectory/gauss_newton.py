@@ -322,16 +322,21 @@ def apply_linear_step(
     )
 
 
-def log_evidence(solution: Solution, observations: Observations, prior: MotionPrior) -> float:
+def log_evidence(
+    solution: Solution, observations: Observations, prior: MotionPrior, step_sigmas: FloatArray | None = None
+) -> float:
     """Log evidence of a prior: logarithm of the measurements' density, trajectory integrated out (Laplace approximation).
 
-    Terms common to all priors are omitted; compare only with the same measurements and noise.
+    Terms common to all priors are omitted; compare only with the same measurements, noise and intervals of rest.
+    ``step_sigmas``, (K - 1, 6): as in :func:`solve`.
     """
     sigmas = axis_sigmas(prior)
+    if step_sigmas is None:
+        step_sigmas = np.repeat(sigmas[None], len(solution.process.information), axis=0)
     # Axes of one kind differ only in sigma.
     _, step_logdet = np.linalg.slogdet(solution.process.information[:, ::3])
-    process_logdet = 3.0 * float(step_logdet.sum()) + 6.0 * len(step_logdet) * float(
-        np.log(sigmas[::3]).sum() * 3.0 - np.log(sigmas).sum()
+    process_logdet = 3.0 * float(step_logdet.sum()) + 6.0 * float(
+        3.0 * np.log(step_sigmas[:, ::3]).sum() - np.log(step_sigmas).sum()
     )
     _, noise_logdet = np.linalg.slogdet(solution.linearised.covariance(observations))
     anchor_logdet = -2.0 * float(np.log(sigmas).sum())

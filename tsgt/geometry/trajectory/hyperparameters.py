@@ -34,6 +34,8 @@ from tsgt.geometry.trajectory.noise_scales import (
     overall_scale,
     scale_noise,
 )
+from tsgt.geometry.trajectory.rest import rest_factors, steps_in_rest
+from tsgt.geometry.trajectory.rest_detection import find_rest
 from tsgt.geometry.trajectory.states import linearise_process
 from tsgt.model import MotionPrior
 
@@ -81,8 +83,15 @@ class _Segment:
 
     def __init__(self, observations: Observations) -> None:
         self.observations = _without_blunders(observations)
+        self.rest = find_rest(observations)
         self.knots: States = initial_guess(self.observations, knot_times(self.observations.time_s))
+        self.moving = ~steps_in_rest(self.rest, self.knots.time_s)
         self.log_evidence = -np.inf
+
+    def factors(self, prior: MotionPrior) -> tuple[FloatArray, FloatArray | None]:
+        """Acceleration sigmas of each step, (K - 1, 6), and what :func:`rest_factors` gives at rest."""
+        moving = np.repeat(axis_sigmas(prior)[None], len(self.moving), axis=0)
+        return rest_factors(self.rest, self.knots.time_s, moving, self.observations.layout)
 
     def record(self, knots: States, log_evidence: float) -> None:
         """Keep a trajectory if it is more probable."""
@@ -224,8 +233,9 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatAr
     """Log evidence of one segment and its gradient by the log parameters."""
     prior, scales = _from_log_parameters(parameters)
     observations = scale_noise(segment.observations, scales)
-    solution = solve(observations, segment.knots, prior, reject_outliers=False)
-    value = log_evidence(solution, observations, prior)
+    step_sigmas, rest = segment.factors(prior)
+    solution = solve(observations, segment.knots, prior, sigmas=step_sigmas, rest=rest, reject_outliers=False)
+    value = log_evidence(solution, observations, prior, step_sigmas)
     segment.record(solution.knots, value)
     covariance, cross_covariance = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
@@ -236,13 +246,15 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatAr
     sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
     energies = _expected_squared_distances(moments, solution.process.phi, solution.process.information)
     for axis, parameter in enumerate(_SIGMA_PARAMETERS):
-        gradient[parameter] += float(energies[:, axis].sum()) - 3.0 * len(energies)
+        gradient[parameter] += float((energies[:, axis] - 3.0)[segment.moving].sum())
     for axes, parameter, time in zip(
         (slice(0, 3), slice(3, 6)), _TIME_PARAMETERS, np.exp(parameters[list(_TIME_PARAMETERS)]), strict=True
     ):
         axis_moments = moments[0][:, axes], moments[1][:, axes], moments[2][:, axes]
         up, down = (
-            _expected_log_density(axis_moments, dt_s, time * np.exp(sign * _DIFFERENCE_STEP), sigmas[axes])
+            _expected_log_density(
+                axis_moments, dt_s, time * np.exp(sign * _DIFFERENCE_STEP), step_sigmas[:, axes]
+            )
             for sign in (1, -1)
         )
         gradient[parameter] = (up - down) / (2 * _DIFFERENCE_STEP)
@@ -310,7 +322,7 @@ def _expected_log_density(moments: _Moments, dt_s: FloatArray, time_s: float, si
     phi, information = transition(dt_s, time_s), process_information(dt_s, time_s)
     squared_distances = _expected_squared_distances(moments, phi[:, None], information[:, None]) / sigmas**2
     _, logdet = np.linalg.slogdet(information)
-    return -0.5 * float(squared_distances.sum()) + 0.5 * len(sigmas) * float(logdet.sum())
+    return -0.5 * float(squared_distances.sum()) + 0.5 * float(sigmas.shape[1] * logdet.sum())
 
 
 NOISE_FLOOR_SHARE = 1.0 / 3.0  # Of the configured prior's process noise

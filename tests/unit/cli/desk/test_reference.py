@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -60,11 +61,28 @@ def test_alignment_agrees_with_evo(
     assert rms(relation.translation_part) == pytest.approx(aligned["position_rms_mm"] / 1e3, abs=1e-6)
     assert rms(relation.rotation_angle_deg) == pytest.approx(aligned["orientation_rms_deg"], abs=1e-6)
     text = tsgt("evaluate", recording, *arguments[:-1], "--align", "translation").out
-    assert "unaligned, positions at the robot's origin (beside it: the prisms' centroid)" in text
+    at = "positions at the robot's origin and at the prisms' centroid"
+    assert f"unaligned; {at}" in text
     aligned_title = (
         "Aligned (translation): remaining error, alignment, and the part of the error that it hides"
     )
-    assert f"{aligned_title}; at the robot's origin" in text
+    assert f"{aligned_title}; {at}" in text
+
+
+def test_every_table_of_errors_names_its_points(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """In its title and in each column of positions: the reference point, or the prisms' centroid."""
+    reference = tmp_path / "linear.tum"
+    assert tsgt("process", recording, "--estimator", "linear", "--output", reference).code == 0
+    arguments = ("--no-held-out", "--reference", reference, "--align", "rigid", "--point", "lidar=1,2,3")
+    text = tsgt("evaluate", recording, *arguments).out
+    titles, headers = zip(*(table.strip().splitlines()[:2] for table in text.split("\n\n")[-2:]), strict=True)
+    assert all("positions at lidar and at the prisms' centroid" in title for title in titles)
+    for header in headers:
+        columns = [column for column in re.split(r"  +", header) if " mm" in column and column != "shift mm"]
+        assert len(columns) >= 2
+        assert all(column.startswith(("lidar ", "centroid ")) for column in columns), header
+    verdict = next(line for line in text.splitlines() if "stated position sigma" in line)
+    assert "at lidar is" in verdict
 
 
 def test_reference_of_another_day_is_an_error(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:

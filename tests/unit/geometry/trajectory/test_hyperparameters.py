@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
+from harness.slow_motion import braking, measure_along
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import exp_so3, log_so3
@@ -21,9 +22,11 @@ from tsgt.geometry.trajectory import (
 )
 from tsgt.geometry.trajectory.hyperparameters import MIN_MEASUREMENTS, partially_occluded
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
+from tsgt.geometry.trajectory.rest_detection import find_rest
 from tsgt.model import MotionPrior, PipelineParameters
 
 if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import Observations
 
 PRIOR = MotionPrior()
@@ -133,10 +136,14 @@ def observations() -> Observations:
     return sorted_by_time(measure(motion, until_s=90.0, seed=12))
 
 
-def test_evidence_gradient_agrees_with_differences(observations: Observations) -> None:
+@pytest.mark.parametrize("stops", [False, True])
+def test_evidence_gradient_agrees_with_differences(observations: Observations, *, stops: bool) -> None:
     """Central differences of the evidence; the noise scale deviates slightly where timestamps are uncertain."""
+    if stops:
+        observations = measure_along(braking(0.5, 8.0, 2.0), until_s=20.0, seed=4)
     exact = replace(observations, time_sigma_s=np.zeros(len(observations)))
     segment = hyperparameters._Segment(exact.select(slice(0, 150)))
+    assert bool(segment.rest) == stops
     rng = np.random.default_rng(3)
     at = np.concatenate([np.log([0.3, 0.15, 0.5, 0.12, 0.2, 0.4, 1.2]), rng.uniform(-0.5, 0.5, 9)])
     hyperparameters._evidence(segment, at)
@@ -146,6 +153,19 @@ def test_evidence_gradient_agrees_with_differences(observations: Observations) -
         aside = step * np.eye(len(at))[i]
         up, down = (hyperparameters._evidence(segment, at + sign * aside)[0] for sign in (1, -1))
         assert gradient[i] == pytest.approx((up - down) / (2 * step), rel=0.05, abs=0.5)
+
+
+def test_stop_does_not_lower_the_process_noise() -> None:
+    """Another minute at rest leaves the prior of the drive as it is, within what a shorter drive finds."""
+
+    def back_and_forth(time_s: FloatArray) -> FloatArray:
+        return 2.0 * np.sin(0.4 * np.minimum(time_s, 10 * np.pi)) ** 4
+
+    whole = measure_along(back_and_forth, until_s=90.0, seed=13)
+    drive = whole.select(whole.time_s < 35.0)
+    assert find_rest(whole)[-1].end_s > 85.0
+    shorter, longer = (tune(each, noise_scale=1.0).prior for each in (drive, whole))
+    np.testing.assert_allclose(axis_sigmas(longer)[:2], axis_sigmas(shorter)[:2], rtol=0.15)
 
 
 def test_tuning_recovers_the_prior(observations: Observations) -> None:

@@ -11,6 +11,7 @@ from tsgt.config import (
     ClientConfig,
     LeicaInstrumentConfig,
     MasterConfig,
+    ReferencePointConfig,
     ScenarioConfig,
     load,
     parameters,
@@ -26,8 +27,12 @@ if TYPE_CHECKING:
 
 def test_master_setup_equals_the_scenario(tmp_path: Path) -> None:
     """The parameters read from the files are those of the scenario."""
-    files = write_demo_files(tmp_path, ScenarioConfig(), tmp_path / "poses.sock")
-    assert parameters(load(files.master_config, MasterConfig)) == scenario_parameters(ScenarioConfig())
+    lidar = ReferencePointConfig(
+        name="lidar", position_m=(0.1, 0.2, 1.3), orientation_xyzw=(0.0, 0.6, 0.0, 0.8)
+    )
+    scenario = ScenarioConfig(reference_point=lidar)
+    files = write_demo_files(tmp_path, scenario, tmp_path / "poses.sock")
+    assert parameters(load(files.master_config, MasterConfig)) == scenario_parameters(scenario)
 
 
 @pytest.mark.parametrize("protocol", ["superframe", "classic"])

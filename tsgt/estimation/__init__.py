@@ -12,6 +12,7 @@ from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
 from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
+from tsgt.estimation.pose_quality import sigma_limits_of
 from tsgt.estimation.reference_point import (
     POINT_COMMENT,
     centroid_at_point,
@@ -58,6 +59,7 @@ __all__ = [
     "poses_at",
     "records_at",
     "reference_point_text",
+    "sigma_limits_of",
     "transform_between",
     "transform_of",
     "usable",

@@ -37,6 +37,7 @@ from tsgt.analysis.evaluation.inter_prism import (
     distances_at_epochs,
     inter_prism,
 )
+from tsgt.analysis.evaluation.live_poses import AgeBin, LivePoseErrors, LivePoses, LivePoseStatistics
 from tsgt.analysis.evaluation.metrics import (
     Align,
     AlignedErrorStatistics,
@@ -61,9 +62,11 @@ from tsgt.analysis.evaluation.residuals import (
     outliers,
     residual_statistics,
 )
+from tsgt.analysis.evaluation.streamed_poses import StreamedPoses, newest_age_s, read_streamed_poses
 
 __all__ = [
     "COMPONENTS",
+    "AgeBin",
     "Align",
     "AlignedErrorStatistics",
     "EpochDistances",
@@ -71,6 +74,9 @@ __all__ = [
     "Fold",
     "HeldOutErrors",
     "InterPrismDistances",
+    "LivePoseErrors",
+    "LivePoseStatistics",
+    "LivePoses",
     "Outlier",
     "PairDistances",
     "PoseComponents",
@@ -81,6 +87,7 @@ __all__ = [
     "RelativeErrors",
     "ResidualStatistics",
     "StationaryStatistics",
+    "StreamedPoses",
     "TransformErrors",
     "absolute_errors",
     "compare",
@@ -95,11 +102,13 @@ __all__ = [
     "inter_prism",
     "interior_mask",
     "interpolation_errors",
+    "newest_age_s",
     "noise_scales_by_axis",
     "normalised_residuals",
     "outliers",
     "pose_components",
     "pose_errors",
+    "read_streamed_poses",
     "read_tum",
     "relative_error_table",
     "residual_statistics",

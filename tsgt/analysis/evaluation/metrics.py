@@ -69,7 +69,15 @@ class NeesStatistics:
         """Compute the NEES of errors, (N, 6), with covariances, (N, 6, 6)."""
         if not len(errors):
             return cls(math.nan, math.nan, math.nan)
-        nees = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
+        return cls.of_squares(
+            np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
+        )
+
+    @classmethod
+    def of_squares(cls, nees: NDArray[np.float64]) -> NeesStatistics:
+        """Summarise the NEES of N poses, (N,)."""
+        if not len(nees):
+            return cls(math.nan, math.nan, math.nan)
         return cls(mean=float(nees.mean()), above_95=float(np.mean(nees > NEES_95)), max=float(nees.max()))
 
 

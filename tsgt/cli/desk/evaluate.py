@@ -12,6 +12,7 @@ from tsgt.analysis.diagnosis import diagnose_smoothed
 from tsgt.analysis.evaluation import held_out_errors, inter_prism, outliers, residual_statistics
 from tsgt.analysis.processing import process
 from tsgt.analysis.smoothing import smooth_recording
+from tsgt.cli.desk.live_poses import compare_live, print_live
 from tsgt.cli.desk.reference import compare_estimators, print_comparisons
 from tsgt.cli.desk.report import assess, print_verdicts, report_evaluation
 from tsgt.cli.options import (
@@ -164,6 +165,7 @@ def evaluate(
         compared = compare_estimators(
             loaded, continuous, reference, paths, stationary_ns=found.stationary_ns, align=alignment
         )
+    live = compare_live(loaded, recording, continuous.poses, reference, keep_going=keep_going)
     if as_json:
         chosen = compared.get(parameters.pipeline.estimator)
         print_json(
@@ -189,6 +191,7 @@ def evaluate(
                 **(
                     {"estimators": {name: each.keys() for name, each in compared.items()}} if compared else {}
                 ),
+                **({} if live is None else {"live": live.keys()}),
             }
         )
         return
@@ -218,6 +221,8 @@ def evaluate(
     _print_outliers(rejected)
     if compared and reference_path is not None:
         print_comparisons(compared, reference_path, alignment, parameters.reference_point)
+    if live is not None:
+        print_live(live, parameters)
 
 
 def _diagnosis(

@@ -356,7 +356,7 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
             *numbers(found["position_rms_mm"], found["centroid"]["position_rms_mm"], digits=1),
             *numbers(found["orientation_rms_deg"]),
             *numbers(found["nees"]["mean"], digits=1),
-            *(_number(found["newest_ms"][key], 0) if "newest_ms" in found else "-" for key in ("p50", "p99")),
+            *(_number(found["age_ms"][key], 0) if "age_ms" in found else "-" for key in ("p50", "p99")),
         ]
         for name, found in {
             **result["estimators"],
@@ -365,7 +365,7 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
     ]
     header = [
         *("", "poses", "valid", f"{point.name} rms mm", "centroid rms mm", "rms deg", "NEES (6)"),
-        *("newest data, age ms: p50", "p99"),
+        *("age ms: p50", "p99"),
     ]
     print_table(header, rows)
     inter_prism_mm = next(iter(result["estimators"].values()))["inter_prism_mean_mm"]

@@ -11,12 +11,11 @@ import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
 from tsgt import service
-from tsgt.analysis.evaluation import PoseErrors, interior_mask
 from tsgt.cli.model_options import model_option
 from tsgt.cli.options import RECORDING_SUFFIXES, OutputFile, json_option, path_type
 from tsgt.cli.output import print_json, require_new_file
@@ -32,38 +31,22 @@ from tsgt.simulation.demo import Demo, write_demo_files
 from tsgt.simulation.options import SimulationOptions
 
 if TYPE_CHECKING:
+    from tsgt.analysis.evaluation import LivePoses
     from tsgt.model import ReferencePoint
     from tsgt.recording import Kind
     from tsgt.simulation.demo import DemoFiles
 
 DEFAULT_DURATION_S = 30.0
 
-
-@dataclass(frozen=True, slots=True)
-class PoseResult:
-    """Poses of one kind and their errors."""
-
-    count: int
-    valid: int
-    errors: PoseErrors
-
-    def keys(self) -> dict[str, Any]:
-        """Return the figures for ``--json``."""
-        return {
-            "poses": self.count,
-            "valid_poses": self.valid,
-            "position_rms_mm": self.errors.position_rms_mm,
-            "orientation_rms_deg": self.errors.orientation_rms_deg,
-            "centroid": dataclasses.asdict(self.errors.centroid),
-        }
+_HEADLINE = ("poses", "valid_poses", "position_rms_mm", "orientation_rms_deg", "centroid")
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Result of a demonstration; ``live`` only if poses are predicted as well."""
+    """Result of a demonstration."""
 
-    poses: PoseResult
-    live: PoseResult | None
+    poses: LivePoses  # the best that the estimator makes
+    live: dict[Kind, LivePoses]  # by kind
     restarts: int
     recording: Path | None
     reference_point: ReferencePoint
@@ -119,9 +102,9 @@ def demo(
     if as_json:
         print_json(
             {
-                **result.poses.keys(),
+                **{name: value for name, value in result.poses.keys().items() if name in _HEADLINE},
                 "reference_point": dataclasses.asdict(result.reference_point),
-                **({} if result.live is None else {"live": result.live.keys()}),
+                "live": {kind: each.keys() for kind, each in result.live.items()},
                 "socket": str(socket_path),
                 "recording": None if result.recording is None else str(result.recording),
                 "folder": str(folder),
@@ -129,7 +112,7 @@ def demo(
             }
         )
         return
-    click.echo(f"poses        {result.poses.count}, of which {result.poses.valid} valid")
+    click.echo(f"poses        {result.poses.poses}, of which {result.poses.valid_poses} valid")
     errors, at = result.poses.errors, point_label(result.reference_point)
     if math.isnan(errors.position_rms_mm):
         click.echo("errors       no valid pose to compare; the first and the last 2 s are not used")
@@ -139,10 +122,12 @@ def demo(
             f"{errors.centroid.position_rms_mm:.1f} mm at the centroid of the prisms"
         )
         click.echo(f"orientation  {errors.orientation_rms_deg:.2f} deg rms error")
-    if result.live is not None:
+    for kind, live in result.live.items():
+        keys = live.keys()
+        age = "newest measurement" if kind == "predicted" else "sent"
         click.echo(
-            f"live         {result.live.valid} of {result.live.count} predictions valid, rms errors "
-            f"{result.live.errors.position_rms_mm:.1f} mm at {at} and {result.live.errors.orientation_rms_deg:.2f} deg"
+            f"{kind:<12} {keys['valid_fraction']:.0%} valid, {age} {keys['age_ms']['p50']:.0f} ms old (median), rms errors "
+            f"{live.errors.position_rms_mm:.1f} mm at {at} and {live.errors.orientation_rms_deg:.2f} deg"
         )
     click.echo(f"files        {folder}: configuration, logs, journals")
     if result.recording is not None:
@@ -172,18 +157,12 @@ def _run(
 
     demo, progress = service.run(run)
     return Result(
-        poses=_poses(progress, progress.kind),
-        live=_poses(progress, "predicted") if progress.poses["predicted"] else None,
+        poses=progress.live_poses(progress.kind),
+        live={kind: progress.live_poses(kind) for kind in sorted(progress.poses)},
         restarts=sum(max(0, process.starts - 1) for process in demo.processes),
         recording=_kept(sorted(files.recordings.glob("*.jsonl")), output),
         reference_point=demo.parameters.reference_point,
     )
-
-
-def _poses(progress: Progress, kind: Kind) -> PoseResult:
-    stamps_ns = progress.valid_stamps_ns(kind)
-    counts = interior_mask(stamps_ns, progress.first_ns, progress.last_ns)
-    return PoseResult(progress.poses[kind], len(stamps_ns), progress.errors(kind, counts))
 
 
 def _kept(recordings: list[Path], output: Path | None) -> Path | None:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Self
 import click
 import numpy as np
 
-from tsgt.analysis.evaluation import PoseErrors, pose_errors
+from tsgt.analysis.evaluation import LivePoseErrors, LivePoses, interior_mask, newest_age_s
 from tsgt.cli.status import station_label
-from tsgt.estimation import centroid_at_point, point_label, transform_of
+from tsgt.estimation import centroid_at_point, point_label, sigma_limits_of, transform_of
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.recording import EventRecord, PoseRecord, StatusRecord, decode
 
@@ -38,11 +38,9 @@ class _ValidPoses:
     """Valid poses of one kind: the newest, those to compare with the truth, and the errors of the others."""
 
     newest: PoseRecord | None = None
-    waiting: list[PoseRecord] = field(default_factory=list)
+    waiting: list[tuple[PoseRecord, float]] = field(default_factory=list)  # with their ages in s
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
-    position_m: array[float] = field(default_factory=lambda: array("d"))
-    centroid_m: array[float] = field(default_factory=lambda: array("d"))
-    rotation_rad: array[float] = field(default_factory=lambda: array("d"))
+    errors: list[LivePoseErrors] = field(default_factory=list)
 
 
 class Progress:
@@ -63,6 +61,7 @@ class Progress:
 
     def __init__(self, demo: Demo, timeline: UnixTimeline) -> None:
         self._demo = demo
+        self._timeline = timeline
         self._start_ns = timeline.unix_ns(demo.start_ns)
         self._valid: defaultdict[Kind, _ValidPoses] = defaultdict(_ValidPoses)
         self._live: Live | None = None
@@ -101,36 +100,41 @@ class Progress:
         """The kind of poses to report: the best that the estimator makes."""
         return "smoothed" if self.poses["predicted"] else "interpolated"
 
-    def valid_stamps_ns(self, kind: Kind) -> NDArray[np.int64]:
-        """Return the Unix times of the valid poses of a kind in ns."""
-        return np.array(self._compared(kind).stamps_ns, dtype=np.int64)
+    def live_poses(self, kind: Kind) -> LivePoses:
+        """Return the poses of a kind so far, with the errors of the valid ones, without 2 s at both ends."""
+        stamps_ns, errors = self._compared(kind)
+        inner = interior_mask(stamps_ns, self.first_ns, self.last_ns)
+        limits = sigma_limits_of(kind, self._demo.parameters.pipeline)
+        return LivePoses(
+            self.poses[kind], len(stamps_ns), errors.age_s, errors.select(inner).statistics(*limits)
+        )
 
-    def errors(self, kind: Kind, mask: NDArray[np.bool_] | None = None) -> PoseErrors:
-        """Return the errors of the valid poses of a kind: of all, or of those in the mask."""
-        compared = self._compared(kind)
-        chosen = slice(None) if mask is None else mask
-        columns = (compared.position_m, compared.centroid_m, compared.rotation_rad)
-        return PoseErrors(*(np.array(column)[chosen] for column in columns))
+    def _compared(self, kind: Kind) -> tuple[NDArray[np.int64], LivePoseErrors]:
+        """Return stamps and errors of all valid poses of a kind, in the order of the stream."""
+        self._compare_waiting(kind)
+        valid = self._valid[kind]
+        valid.errors = [LivePoseErrors.concatenated(valid.errors)]
+        return np.array(valid.stamps_ns, dtype=np.int64), valid.errors[0]
 
-    def _compared(self, kind: Kind) -> _ValidPoses:
+    def _compare_waiting(self, kind: Kind) -> None:
         """Compare the waiting poses with the truth."""
         valid = self._valid[kind]
-        poses, valid.waiting = valid.waiting, []
+        waiting, valid.waiting = valid.waiting, []
+        poses = [pose for pose, _ in waiting]
         stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
         positions = np.array([pose.position_m for pose in poses], dtype=np.float64).reshape(-1, 3)
         quaternions = np.array([pose.orientation_xyzw for pose in poses], dtype=np.float64).reshape(-1, 4)
         parameters = self._demo.parameters
         truth = self._demo.world.pose_at((stamps_ns - self._start_ns) / 1e9)
-        errors = pose_errors(
+        errors = LivePoseErrors.of(
             transform_from(rotation_from_quaternion(quaternions), positions),
+            np.array([pose.covariance for pose in poses], dtype=np.float64).reshape(-1, 6, 6),
+            np.array([age_s for _, age_s in waiting]),
             truth @ transform_of(parameters.reference_point),
             centroid_at_point(parameters),
         )
         valid.stamps_ns.extend(stamps_ns.tolist())
-        valid.position_m.extend(errors.position_m.tolist())
-        valid.centroid_m.extend(errors.centroid_m.tolist())
-        valid.rotation_rad.extend(errors.rotation_rad.tolist())
-        return valid
+        valid.errors.append(errors)
 
     def _pose(self, pose: PoseRecord) -> None:
         self.first_ns = self.first_ns or pose.stamp_ns
@@ -139,9 +143,10 @@ class Progress:
         if pose.valid:
             valid = self._valid[pose.kind]
             valid.newest = pose
-            valid.waiting.append(pose)
+            sent_s = (self._timeline.unix_ns(time.monotonic_ns()) - pose.stamp_ns) / 1e9
+            valid.waiting.append((pose, newest_age_s(pose) if pose.kind == "predicted" else sent_s))
             if len(valid.waiting) == _BATCH_POSES:
-                self._compared(pose.kind)
+                self._compare_waiting(pose.kind)
 
     def _status(self, status: StatusRecord) -> None:
         starts = sum(process.starts for process in self._demo.processes)
@@ -154,13 +159,19 @@ class Progress:
             return
         self._printed_at_s = now_s
         elapsed_s = (status.stamp_ns - self._start_ns) / 1e9
-        newest, errors = self._valid[self.kind].newest, self.errors(self.kind)
-        text = f"{elapsed_s:5.0f} s  {len(errors.position_m)}/{self.poses[self.kind]} poses valid"
+        newest = self._valid[self.kind].newest
+        text = f"{elapsed_s:5.0f} s"
         if newest is not None:
             position = " ".join(f"{value:6.2f}" for value in newest.position_m or ())
-            at = point_label(self._demo.parameters.reference_point)
-            text += f"  {at} at {position} m  error {errors.position_rms_mm:.1f} mm rms"
+            text += f"  {point_label(self._demo.parameters.reference_point)} at {position} m"
         lines = [text]
+        for kind in sorted(self.poses):
+            keys = self.live_poses(kind).keys()
+            lines.append(
+                f"         {kind:<12} {keys['valid_poses']}/{keys['poses']} poses valid  "
+                f"{'newest measurement' if kind == 'predicted' else 'sent'} {keys['age_ms']['p50']:.0f} ms old  "
+                f"error {keys['position_rms_mm']:.1f} mm {keys['orientation_rms_deg']:.2f} deg rms"
+            )
         for station in status.stations:
             label, _ = station_label(station)
             rate = "" if station.rate_hz is None else f"  {station.rate_hz:.2f} Hz"

@@ -14,10 +14,16 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from tsgt.analysis.evaluation import PoseErrorStatistics, inter_prism, interior_mask
+from tsgt.analysis.evaluation import (
+    LivePoseErrors,
+    LivePoses,
+    PoseErrorStatistics,
+    inter_prism,
+    interior_mask,
+)
 from tsgt.analysis.processing import Estimator, process, with_estimator
 from tsgt.errors import RecordingError
-from tsgt.estimation import PoseBatch, build_tracks, centroid_at_point
+from tsgt.estimation import PoseBatch, build_tracks, centroid_at_point, sigma_limits_of
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.recording import Recording, RecordingHeader
 
@@ -41,16 +47,15 @@ class EstimatorFigures:
 def pose_keys(run: MissionResult) -> dict[str, Any]:
     """Return all figures for ``--json``."""
     inter_prism_mean_mm = _inter_prism_mean_mm(run)
+    live = {kind: found.keys() for kind, found in live_figures(run).items()}
     return {
         "reference_point": dataclasses.asdict(run.parameters.reference_point),
         "estimators": {
             name: {**_keys(found), "inter_prism_mean_mm": inter_prism_mean_mm}
             for name, found in estimator_figures(run).items()
         },
-        "live": {
-            kind: {**_keys(found), "newest_ms": dict(zip(("p50", "p99"), newest_ms(run, kind), strict=True))}
-            for kind, found in live_figures(run).items()
-        },
+        "live": live,
+        "nees": {kind: found["nees"] for kind, found in live.items()},
     }
 
 
@@ -97,7 +102,7 @@ def _processed_figures(run: MissionResult, recording: Recording) -> EstimatorFig
     )
 
 
-def live_figures(run: MissionResult) -> dict[Kind, EstimatorFigures]:
+def live_figures(run: MissionResult) -> dict[Kind, LivePoses]:
     """Compare the streamed poses with the truth, by kind."""
     counts: Counter[Kind] = Counter()
     for session in run.master_logs:
@@ -106,25 +111,28 @@ def live_figures(run: MissionResult) -> dict[Kind, EstimatorFigures]:
     found = {}
     for kind, count in sorted(counts.items()):
         some = [poses.select(poses.kind == kind) for poses in streamed]
-        stamp_ns = [
-            poses.stamp_ns + run.start_ns - session.unix_at_zero_ns
-            for session, poses in zip(run.master_logs, some, strict=True)
-        ]
-        names = ("position_m", "orientation_xyzw", "covariance")
-        columns = (np.concatenate([getattr(poses, name) for poses in some]) for name in names)
-        found[kind] = _pose_figures(run, count, np.concatenate(stamp_ns), *columns)
+        stamp_ns = np.concatenate(
+            [
+                poses.stamp_ns + run.start_ns - session.unix_at_zero_ns
+                for session, poses in zip(run.master_logs, some, strict=True)
+            ]
+        )
+        age_name = "newest_age_s" if kind == "predicted" else "sent_age_s"
+        names = ("position_m", "orientation_xyzw", "covariance", age_name)
+        position_m, orientation_xyzw, covariance, age_s = (
+            np.concatenate([getattr(poses, name) for poses in some]) for name in names
+        )
+        inner = interior_mask(stamp_ns, run.start_ns, run.end_ns)
+        errors = LivePoseErrors.of(
+            transform_from(rotation_from_quaternion(orientation_xyzw[inner]), position_m[inner]),
+            covariance[inner],
+            age_s[inner],
+            run.true_poses((stamp_ns[inner] - run.start_ns) / 1e9),
+            centroid_at_point(run.parameters),
+        )
+        limits = sigma_limits_of(kind, run.parameters.pipeline)
+        found[kind] = LivePoses(count, len(stamp_ns), age_s, errors.statistics(*limits))
     return found
-
-
-def newest_ms(run: MissionResult, kind: Kind) -> tuple[float, float]:
-    """Return percentiles 50 and 99 of the age of the newest measurement at the epoch of a streamed pose; NaN without."""
-    streamed = [session.valid_poses() for session in run.master_logs]
-    ages_s = np.concatenate([poses.newest_age_s[poses.kind == kind] for poses in streamed])
-    known = ages_s[np.isfinite(ages_s)]
-    if not len(known):
-        return math.nan, math.nan
-    p50, p99 = np.percentile(known, [50, 99]).tolist()
-    return 1e3 * p50, 1e3 * p99
 
 
 def _pose_figures(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tsgt.geometry.trajectory.adaptive_noise import ADAPTATIONS, adapted_sigmas
 from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest_knots, solve
 from tsgt.geometry.trajectory.hyperparameters import (
     NOISE_FLOOR_SHARE,
@@ -24,7 +25,7 @@ from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.noise_scales import scale_noise
 from tsgt.geometry.trajectory.query import Trajectory
-from tsgt.geometry.trajectory.rest import RestInterval, rest_factors, with_vibration
+from tsgt.geometry.trajectory.rest import RestInterval, rest_factors, steps_in_rest, with_vibration
 from tsgt.geometry.trajectory.rest_detection import find_rest
 from tsgt.geometry.trajectory.states import concatenate_states
 from tsgt.model import MotionPrior
@@ -32,10 +33,17 @@ from tsgt.model import MotionPrior
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from numpy.typing import NDArray
+
     from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory.gauss_newton import Solution
     from tsgt.geometry.trajectory.measurement_factors import Observations
+    from tsgt.geometry.trajectory.states import States
 
 KNOTS_PER_SEGMENT = 1024  # About two minutes of 3 stations at 2.5 Hz: their blocks fit into the cache
+MAX_ADAPTED_ITERATIONS = (
+    6  # From the solution before the last adaptation, which is close; two or three suffice
+)
 OVERLAP_KNOTS = 128  # Knots on either side of a segment that are solved with it and discarded
 
 
@@ -104,24 +112,30 @@ def fit_trajectory(
     observations = with_vibration(scale_noise(observations, scales), rest, observations.sigmas_m)
     times_s = knot_times(observations.time_s)
     knot_index = nearest_knots(times_s, observations.time_s)
-    sigmas = _sigmas(observations, times_s, prior, occluded_prior or prior)
-    sigmas, at_rest = rest_factors(rest, times_s, sigmas, observations.layout)
+    occluded = partially_occluded(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
+    occluded_sigmas = axis_sigmas(with_noise_floor(prior, occluded_prior or prior))
+    sigmas = np.where(occluded[:, None], occluded_sigmas, axis_sigmas(prior))
+    sigmas, rest_information = rest_factors(rest, times_s, sigmas, observations.layout)
+    adaptable = ~occluded & ~steps_in_rest(rest, times_s)
     segments = _segments(len(times_s))
     tracks = PrismTracks.of(observations)
     knots, covariances, cross_covariances, residuals_m, squared_distances, weights = [], [], [], [], [], []
+    adapted = sigmas.copy()
     for completed, segment in enumerate(segments):
         report_progress(completed / len(segments))
         rows = slice(*np.searchsorted(knot_index, (segment.solved.start, segment.solved.stop)))
-        guess = tracks.guess(times_s[segment.solved])
         steps = slice(segment.solved.start, segment.solved.stop - 1)
-        solution = solve(
+        found = _solve_adapting(
             observations.select(rows),
-            guess,
+            tracks.guess(times_s[segment.solved]),
             prior,
-            sigmas=sigmas[steps],
-            rest=None if at_rest is None else at_rest[steps],
+            sigmas[steps],
+            None if rest_information is None else rest_information[steps],
+            adaptable[steps],
         )
-        covariance, cross_covariance = solution.factor.marginals()
+        solution, covariance, cross_covariance = found.solution, found.covariance, found.cross_covariance
+        kept_steps = slice(segment.kept.start, min(segment.kept.stop, len(adapted)))
+        adapted[kept_steps] = found.sigmas[kept_steps.start - steps.start : kept_steps.stop - steps.start]
         kept_knots = slice(
             segment.kept.start - segment.solved.start, segment.kept.stop - segment.solved.start
         )
@@ -139,7 +153,7 @@ def fit_trajectory(
         prior,
         np.concatenate(covariances),
         np.concatenate(cross_covariances)[: len(times_s) - 1],
-        sigmas,
+        adapted,
     )
     return TrajectoryFit(
         trajectory,
@@ -152,14 +166,40 @@ def fit_trajectory(
     )
 
 
-def _sigmas(
-    observations: Observations, times_s: FloatArray, prior: MotionPrior, occluded_prior: MotionPrior
-) -> FloatArray:
-    """(K - 1, 6) acceleration sigmas of each step between knots."""
-    occluded = partially_occluded(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
-    return np.where(
-        occluded[:, None], axis_sigmas(with_noise_floor(prior, occluded_prior)), axis_sigmas(prior)
-    )
+class _AdaptedSolution(NamedTuple):
+    """A solution, its marginals, and the acceleration sigmas that it was found with, (K - 1, 6)."""
+
+    solution: Solution
+    covariance: FloatArray
+    cross_covariance: FloatArray
+    sigmas: FloatArray
+
+
+def _solve_adapting(
+    observations: Observations,
+    guess: States,
+    prior: MotionPrior,
+    initial_sigmas: FloatArray,
+    rest: FloatArray | None,
+    adaptable: NDArray[np.bool_],
+) -> _AdaptedSolution:
+    """Solve, and adapt the process noise to the motion; arguments as for :func:`solve` and :func:`adapted_sigmas`."""
+    sigmas = initial_sigmas
+    solution = solve(observations, guess, prior, sigmas=sigmas, rest=rest)
+    for _ in range(ADAPTATIONS):
+        marginals = solution.factor.marginals()
+        sigmas = adapted_sigmas(
+            solution, *marginals, sigmas=sigmas, initial_sigmas=initial_sigmas, adaptable=adaptable
+        )
+        solution = solve(
+            observations,
+            solution.knots,
+            prior,
+            sigmas=sigmas,
+            rest=rest,
+            max_iterations=MAX_ADAPTED_ITERATIONS,
+        )
+    return _AdaptedSolution(solution, *solution.factor.marginals(), sigmas)
 
 
 def _segments(count: int) -> list[_Segment]:

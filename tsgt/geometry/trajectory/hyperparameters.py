@@ -34,9 +34,13 @@ from tsgt.geometry.trajectory.noise_scales import (
     overall_scale,
     scale_noise,
 )
+from tsgt.geometry.trajectory.process_moments import (
+    ProcessMoments,
+    expected_moments,
+    expected_squared_distances,
+)
 from tsgt.geometry.trajectory.rest import rest_factors, steps_in_rest
 from tsgt.geometry.trajectory.rest_detection import find_rest
-from tsgt.geometry.trajectory.states import linearise_process
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -45,7 +49,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory.gauss_newton import Solution
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.states import States
 
@@ -242,9 +245,9 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatAr
     by_scale = log_scale_gradient(solution, observations, covariance)
     gradient[_SCALE_PARAMETER] = by_scale.sum()
     gradient[_SCALE_PARAMETER + 1 :] = by_scale.ravel()
-    moments = _expected_moments(solution, covariance, cross_covariance)
+    moments = expected_moments(solution, covariance, cross_covariance)
     sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
-    energies = _expected_squared_distances(moments, solution.process.phi, solution.process.information)
+    energies = expected_squared_distances(moments, solution.process.phi, solution.process.information)
     for axis, parameter in enumerate(_SIGMA_PARAMETERS):
         gradient[parameter] += float((energies[:, axis] - 3.0)[segment.moving].sum())
     for axes, parameter, time in zip(
@@ -265,62 +268,12 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatAr
     return value, gradient
 
 
-_Moments = tuple["FloatArray", "FloatArray", "FloatArray"]
-
-
-def _expected_moments(solution: Solution, covariance: FloatArray, cross_covariance: FloatArray) -> _Moments:
-    """(K - 1, 6, 3, 3) second moments by process factor and axis: of the later state, later with earlier, of the earlier."""
-    linearised = linearise_process(solution.knots, solution.process)
-    count = len(cross_covariance)
-    earlier, later = linearised.earlier, linearised.later
-    moments = later[..., :, None] * later[..., None, :]
-    cross = later[..., :, None] * earlier[..., None, :]
-    earlier_earlier = earlier[..., :, None] * earlier[..., None, :]
-    # The residual is later - Phi earlier; position and rotation are relative to the earlier knot.
-    by_earlier, by_later = np.zeros((2, count, 9, 9)), np.zeros((2, count, 9, 9))
-    by_earlier[0, :, range(3), range(3)] = -1.0
-    by_earlier[1, :, :3, :6] = linearised.rotation_by_earlier
-    by_later[:, :, range(9), range(9)] = 1.0
-    by_later[1, :, :3, :6] = linearised.rotation_by_later
-    for kind, axes in ((0, slice(0, 3)), (1, slice(3, 6))):
-        first, last, coupling = (
-            matrix.reshape(count, 3, 2, 3, 3, 2, 3)[:, :, kind, :, :, kind].reshape(count, 9, 9)
-            for matrix in (covariance[:-1], covariance[1:], cross_covariance)
-        )
-        cov_with_earlier = by_earlier[kind] @ first + by_later[kind] @ np.swapaxes(coupling, 1, 2)
-        cov_with_later = by_earlier[kind] @ coupling + by_later[kind] @ last
-        both = cov_with_earlier @ np.swapaxes(by_earlier[kind], 1, 2) + cov_with_later @ np.swapaxes(
-            by_later[kind], 1, 2
-        )
-        moments[:, axes] += _axis_blocks(both)
-        cross[:, axes] += _axis_blocks(cov_with_earlier)
-        earlier_earlier[:, axes] += _axis_blocks(first)
-    cross[..., :, 0] = 0.0
-    earlier_earlier[..., :, 0] = earlier_earlier[..., 0, :] = 0.0
-    return moments, cross, earlier_earlier
-
-
-def _axis_blocks(matrix: FloatArray) -> FloatArray:
-    """(N, 3, 3, 3) diagonal axis blocks of (N, 9, 9)."""
-    blocks: FloatArray = np.einsum("niaja->naij", matrix.reshape(-1, 3, 3, 3, 3))
-    return blocks
-
-
-def _expected_squared_distances(
-    process_moments: _Moments, phi: FloatArray, information: FloatArray
-) -> FloatArray:
-    """(K - 1, A) expected squared Mahalanobis distances of the process residuals of A axes."""
-    moments, cross, earlier = process_moments
-    coupling = phi @ np.swapaxes(cross, -1, -2)
-    residual = moments - coupling - np.swapaxes(coupling, -1, -2) + phi @ earlier @ np.swapaxes(phi, -1, -2)
-    expected: FloatArray = (information * residual).sum(axis=(2, 3))
-    return expected
-
-
-def _expected_log_density(moments: _Moments, dt_s: FloatArray, time_s: float, sigmas: FloatArray) -> float:
+def _expected_log_density(
+    moments: ProcessMoments, dt_s: FloatArray, time_s: float, sigmas: FloatArray
+) -> float:
     """Return the expected log density of the process residuals, as far as it depends on the correlation time."""
     phi, information = transition(dt_s, time_s), process_information(dt_s, time_s)
-    squared_distances = _expected_squared_distances(moments, phi[:, None], information[:, None]) / sigmas**2
+    squared_distances = expected_squared_distances(moments, phi[:, None], information[:, None]) / sigmas**2
     _, logdet = np.linalg.slogdet(information)
     return -0.5 * float(squared_distances.sum()) + 0.5 * float(sigmas.shape[1] * logdet.sum())
 

@@ -67,7 +67,7 @@ def test_noisy_axis_is_detected(observations: Observations) -> None:
     distance_m = np.linalg.norm(observations.points_m, axis=1)[:, None]
     spoilt = replace(observations, points_m=observations.points_m * (1 + worse / distance_m))
     found = residual_statistics(fitted(spoilt), sources(spoilt))
-    assert found[11]["range"].std > 2.5
+    assert found[11]["range"].std > 2.3
     assert found[11]["horizontal_angle"].std < 1.5
     assert found[10]["range"].std < 1.7
 

@@ -104,7 +104,7 @@ def main() -> None:
             else:
                 print(f"{estimator}: rms {rms:.2f}")
     below.plot(time_s, found.speed_mps[shown], color="#444444", lw=0.9)
-    above.set_ylabel("position error\nat the prisms in mm")
+    above.set_ylabel("position error at the\nprisms' centroid in mm")
     middle.set_ylabel("rotation error\nin degrees")
     below.set_ylabel("speed\nin m/s")
     below.set_xlabel("time in s")

@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 _LAYOUT_HEIGHT_MM = 115.0
-_SIGMA_LABELS = ("position, one sigma (mm)", "rotation, one sigma (mrad)")
 
 
 def draw_layouts(
     covariances: Mapping[str, FloatArray],
     distances: Mapping[float, Mapping[str, PoseAccuracy]],
+    point_m: FloatArray,
     path: Path,
 ) -> None:
     """Draw the layouts over the robot's heading, and the first one over distance and arrangement of the stations.
 
     ``covariances``: by name in the order of the ranking, (N, 6, 6) of robot poses with
     :data:`tsgt.analysis.design.layout_study.HEADING_COUNT` headings at each place. ``distances``: by the stations' distance
-    in m and the name of their arrangement. Raises MissingExtraError without matplotlib, OutputFileError if it cannot write.
+    in m and the name of their arrangement. ``point_m``: the point of the positions, (3,) in the robot frame. Raises MissingExtraError without matplotlib, OutputFileError if it cannot write.
     """
     heading_deg = np.arange(HEADING_COUNT + 1) * (360 / HEADING_COUNT)
     distance_m = list(distances)
@@ -48,7 +48,11 @@ def draw_layouts(
             found = [by_name[arrangement] for by_name in distances.values()]
             for row, sigmas_m in enumerate(([f.position_m for f in found], [f.rotation_rad for f in found])):
                 axes[row, 1].plot(distance_m, 1e3 * np.array(sigmas_m), **stroke._asdict(), label=arrangement)
-        for row, unit in enumerate(_SIGMA_LABELS):
+        labels = (
+            f"one sigma of the position\nof {_point_text(point_m)} (mm)",
+            "one sigma of the rotation (mrad)",
+        )
+        for row, unit in enumerate(labels):
             axes[row, 0].set_ylabel(unit)
             axes[row, 0].set_ylim(bottom=0)
         axes[1, 0].set_xticks(range(0, 361, 90))
@@ -66,16 +70,18 @@ def draw_layouts(
 
 _STUDY_HEIGHT_MM = 95.0
 _PANEL_TITLES = (("x", "y", "z", "length"), ("roll", "pitch", "yaw", "angle"))
-_ERROR_LABELS = ("position error (mm)", "rotation error (rad)")
 
 
 def draw_perturbation(
-    study: Sequence[Perturbation], first_order_per_mm: tuple[FloatArray, FloatArray], paths: Sequence[Path]
+    study: Sequence[Perturbation],
+    first_order_per_mm: tuple[FloatArray, FloatArray],
+    point_m: FloatArray,
+    paths: Sequence[Path],
 ) -> None:
     """Draw mean and standard deviation of the pose errors over the noise, per axis and of the norm.
 
     ``study``: in the order of the noise. ``first_order_per_mm``: sigmas of position (m) and rotation (rad) for 1 mm of
-    noise, (3,) each. Raises as :func:`draw_layouts`.
+    noise, (3,) each. ``point_m`` and exceptions as for :func:`draw_layouts`.
     """
     noise_mm = np.array([1e3 * each.noise_m for each in study])
     position_mm = 1e3 * np.array(
@@ -100,7 +106,8 @@ def draw_perturbation(
                 if column < 3:
                     _first_order(panel, noise_mm, expected[row][:, column])
                 panel.set_title(name)
-            axes[row, 0].set_ylabel(_ERROR_LABELS[row])
+            position_label = f"position error of\n{_point_text(point_m)} (mm)"
+            axes[row, 0].set_ylabel("rotation error (rad)" if row else position_label)
             # Scale to the samples: a diverging first-order line must not compress them.
             low, high = (mean - std).min(), (mean + std).max()
             room = 0.08 * (high - low) or 1.0
@@ -112,6 +119,10 @@ def draw_perturbation(
         figure.legend(handles, labels, loc="outside upper center", ncols=3)
         for path in paths:
             save(figure, path)
+
+
+def _point_text(point_m: FloatArray) -> str:
+    return "({:.2f}, {:.2f}, {:.2f}) m".format(*(np.round(point_m, 2) + 0.0))
 
 
 def _band(panel: Axes, noise_mm: FloatArray, mean: FloatArray, std: FloatArray) -> None:

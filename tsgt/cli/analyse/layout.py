@@ -163,7 +163,7 @@ def layout_command(
     if figure is not None:
         from tsgt.analysis.figures import draw_layouts
 
-        draw_layouts({c.name: c.covariance for c in candidates}, distances, figure)
+        draw_layouts({c.name: c.covariance for c in candidates}, distances, point, figure)
     if as_json:
         print_json(
             {
@@ -291,7 +291,7 @@ def _print_best(found: _Candidate, slots: Mapping[int, int]) -> None:
 
 
 def _print_distances(name: str, distances: Mapping[float, Mapping[str, PoseAccuracy]]) -> None:
-    click.echo(f"\nOther station positions, with {name} (mm, mrad)\n")
+    click.echo(f"\nOther station positions, with {name}, for the same point (mm, mrad)\n")
     rows = []
     for distance_m, found in distances.items():
         figures = [value for f in found.values() for value in (f.position_m, f.rotation_rad)]

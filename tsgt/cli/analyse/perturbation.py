@@ -117,7 +117,7 @@ def perturbation_command(
     if figure is not None:
         from tsgt.analysis.figures import draw_perturbation
 
-        draw_perturbation(study, per_mm, [figure])
+        draw_perturbation(study, per_mm, point, [figure])
     if as_json:
         print_json(
             {

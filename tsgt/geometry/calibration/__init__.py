@@ -10,6 +10,27 @@ from tsgt.geometry.calibration.motion_initialisation import frames_from_motion
 from tsgt.geometry.calibration.observability import UnobservableDirection, unobservable_directions
 from tsgt.geometry.calibration.setup_parameters import Setup, SetupParameters
 from tsgt.geometry.calibration.setup_prior import SetupPrior, calibrated_covariance
+from tsgt.geometry.calibration.station_frames import (
+    CONSISTENCY,
+    Check,
+    checks,
+    station_frames,
+    unweighted_frames,
+)
+from tsgt.geometry.calibration.target_calibration import (
+    ErrorEstimate,
+    FitQuality,
+    NetworkCalibration,
+    calibrate_network,
+)
+from tsgt.geometry.calibration.target_causes import Cause, CauseKind, rejected_targets
+from tsgt.geometry.calibration.target_network import (
+    DATA_SHEET_SIGMA,
+    ERRORS,
+    Column,
+    InstrumentError,
+    TargetReadings,
+)
 from tsgt.geometry.calibration.targets import (
     FALSE_ALARM_RATE,
     MIN_POINTS,
@@ -22,12 +43,23 @@ from tsgt.geometry.calibration.targets import (
 )
 
 __all__ = [
+    "CONSISTENCY",
+    "DATA_SHEET_SIGMA",
+    "ERRORS",
     "FALSE_ALARM_RATE",
     "MIN_POINTS",
     "STATION_LIMITS",
+    "Cause",
+    "CauseKind",
+    "Check",
+    "Column",
+    "ErrorEstimate",
+    "FitQuality",
     "FrameCalibration",
     "FrameFit",
+    "InstrumentError",
     "MotionCalibration",
+    "NetworkCalibration",
     "PointName",
     "PointPairs",
     "PointSet",
@@ -35,13 +67,19 @@ __all__ = [
     "Setup",
     "SetupParameters",
     "SetupPrior",
+    "TargetReadings",
     "UnobservableDirection",
     "WeakAxis",
     "calibrate_frame",
     "calibrate_motion",
+    "calibrate_network",
     "calibrate_prisms",
     "calibrated_covariance",
+    "checks",
     "fit_frame",
     "frames_from_motion",
+    "rejected_targets",
+    "station_frames",
     "unobservable_directions",
+    "unweighted_frames",
 ]

@@ -17,6 +17,8 @@ from tsgt.geometry.calibration.frame_fit import PointPairs, PointSet, fit_frame,
 from tsgt.geometry.rigid import transform_from, transform_points
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from tsgt.geometry.calibration.frame_fit import PointName
     from tsgt.geometry.rigid import FloatArray
 
@@ -151,7 +153,21 @@ def calibrate_frame(
         )
     fit_frame(pairs, weighted=True)  # raises for a degenerate set
     outliers = _outliers(pairs, limits.blunder_m)
-    kept = pairs.without(*(outliers or ()))
+    return frame_without(
+        pairs, outliers or (), weighted=weighted, limits=limits, consistent=outliers is not None
+    )
+
+
+def frame_without(
+    pairs: PointPairs,
+    outliers: Sequence[PointName],
+    *,
+    weighted: bool,
+    limits: Limits,
+    consistent: bool = True,
+) -> FrameCalibration:
+    """Fit a frame to all but the outliers, whatever the residuals are."""
+    kept = pairs.without(*outliers)
     fit = fit_frame(kept, weighted=weighted)
     predictions = [_Prediction.of(kept, name, weighted=weighted) for name in kept.names]
     return FrameCalibration(
@@ -161,12 +177,11 @@ def calibrate_frame(
         residuals_m=np.linalg.norm(fit.residuals_m(kept), axis=1),
         leave_one_out_m=np.array([np.nan if p is None else p.length_m for p in predictions]),
         rejected=tuple(
-            RejectedPoint(name, float(np.linalg.norm(fit.residuals_m(pairs.only(name)))))
-            for name in outliers or ()
+            RejectedPoint(name, float(np.linalg.norm(fit.residuals_m(pairs.only(name))))) for name in outliers
         ),
-        consistent=outliers is not None,
-        weak=_weak_axes(fit.covariance, kept.target.points_m, limits.weak_rad),
-        tilt_rad=_tilt_rad(kept) if levelled else None,
+        consistent=consistent,
+        weak=weak_axes(fit.covariance, kept.target.points_m, limits.weak_rad),
+        tilt_rad=_tilt_rad(kept) if pairs.levelled else None,
     )
 
 
@@ -267,7 +282,7 @@ def _outliers(pairs: PointPairs, blunder_m: float) -> tuple[PointName, ...] | No
     )
 
 
-def _weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) -> tuple[WeakAxis, ...]:
+def weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) -> tuple[WeakAxis, ...]:
     """Principal axes of the rotation's covariance whose sigma exceeds the limit, worst first."""
     variances, axes = np.linalg.eigh(covariance[3:, 3:])
     weak = []

@@ -1,0 +1,245 @@
+"""Causes of a misfit of target measurements: instrument errors, wrong sights of targets, a tripod that moved.
+
+A *sight* is all readings of one target by one station. The causes that the readings support are selected together, so that
+an index error is not taken for bad far targets nor the reverse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import chdtri
+
+from tsgt.geometry.calibration.cause_search import CauseSearch
+from tsgt.geometry.calibration.target_network import ERRORS, TARGET_CONSTANT
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.calibration.cause_search import Subset
+    from tsgt.geometry.calibration.target_network import InstrumentError, Linearisation, TargetReadings
+    from tsgt.geometry.rigid import FloatArray
+
+INSTRUMENT_FALSE_ALARM_RATE = 1e-3  # Of any instrument error, in a set that matches its noise model
+SIGHT_FALSE_ALARM_RATE = 1e-4  # Of any sight; the same for a tripod and a tilt
+MAX_SIGHTS = 60  # Candidates; of a larger set those with the largest residuals
+MIN_TARGETS_PER_ROUND = 3  # Before and after a tripod moved, to tell it from wrong sights
+
+
+class CauseKind(StrEnum):
+    """What a cause is."""
+
+    INSTRUMENT = "instrument"
+    TARGET_CONSTANT = "target_constant"  # Of all stations alike
+    SIGHT = "sight"
+    TRIPOD = "tripod"  # Moved between two of a station's sights
+    TILT = "tilt"  # Of a station that is taken as levelled
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cause:
+    """One possible cause, and its size if it was selected."""
+
+    kind: CauseKind
+    station: int  # Row; 0 if it concerns all
+    target: int | None = None  # Row; of a tripod the first one measured after it moved
+    error: InstrumentError | None = None
+    # Only two stations measured the target: which of them is wrong cannot be seen
+    either_station: bool = False
+    # INSTRUMENT: (1,) its value; TARGET_CONSTANT: (1,) m; SIGHT: (3,) displacement in the first station's frame in m;
+    # TRIPOD: (4,) displacement in m and heading in rad; TILT: (2,) rad
+    value: FloatArray | None = None
+    alternatives: tuple[Cause, ...] = ()  # Causes that the readings do not exclude in its place
+
+    @property
+    def label(self) -> tuple[CauseKind, int, int | None, InstrumentError | None]:
+        """What identifies it."""
+        return self.kind, self.station, self.target, self.error
+
+    @property
+    def size_m(self) -> float:
+        """Length of a displacement."""
+        assert self.value is not None  # noqa: S101 (of selected causes)
+        return float(np.linalg.norm(self.value[:3]))
+
+
+@dataclass(frozen=True, slots=True)
+class SelectionRules:
+    """What may be selected.
+
+    ``blunder_m``: smallest displacement of a sight; ``levelled``: look for tilts; ``limited``: reject at most so many targets
+    that the others still outvote them, :func:`max_rejected`.
+    """
+
+    blunder_m: float
+    levelled: bool
+    limited: bool = True
+
+
+def max_rejected(targets: int) -> int:
+    """Most targets of a station that may be rejected: at least four remain, and most of all."""
+    return max((targets - 3) // 2, 0)
+
+
+def select_causes(
+    readings: TargetReadings, linear: Linearisation, rules: SelectionRules
+) -> tuple[Cause, ...]:
+    """Select the causes that explain the misfit of a linearisation without any of them."""
+    candidates = _candidates(readings, linear, rules)
+    while True:
+        columns = np.concatenate([columns for _, columns, _ in candidates], axis=2)
+        residuals = linear.project(linear.y[:, :, None])[:, :, 0]
+        ends = np.cumsum([0, *(each.shape[2] for _, each, _ in candidates)])
+        causes = [cause for cause, _, _ in candidates]
+        search = CauseSearch(
+            columns.reshape(-1, columns.shape[2]),
+            linear.project(columns).reshape(-1, columns.shape[2]),
+            residuals.ravel(),
+            redundancy=linear.redundancy,
+            blocks=[range(a, b) for a, b in pairwise(ends)],
+            penalties=np.array([penalty for _, _, penalty in candidates]),
+            allowed=_Allowed(readings, causes, limited=rules.limited),
+        )
+        chosen = search.best()
+        values = search.estimates(chosen)
+        small = [
+            row
+            for row in chosen
+            if causes[row].kind is CauseKind.SIGHT and np.linalg.norm(values[row]) < rules.blunder_m
+        ]
+        if not small:
+            break
+        candidates = [each for row, each in enumerate(candidates) if row not in small]
+    alternatives = search.alternatives(chosen)
+
+    def is_plausible(row: int, other: int) -> bool:
+        if causes[other].kind is not CauseKind.SIGHT:
+            return True
+        exchanged = tuple(other if each == row else each for each in chosen)
+        return bool(np.linalg.norm(search.estimates(exchanged)[other]) >= rules.blunder_m)
+
+    return tuple(
+        replace(
+            causes[row],
+            value=values[row][: ends[row + 1] - ends[row]],
+            alternatives=tuple(causes[other] for other in alternatives[row] if is_plausible(row, other)),
+        )
+        for row in chosen
+    )
+
+
+_Candidate = tuple[Cause, "FloatArray", float]  # Cause, columns (n, 3, c), penalty
+
+
+def _candidates(readings: TargetReadings, linear: Linearisation, rules: SelectionRules) -> list[_Candidate]:
+    stations = range(len(readings.stations))
+    instruments = [
+        (Cause(CauseKind.INSTRUMENT, station, error=error), linear.columns(((station, 6 + row),)))
+        for station in stations
+        for row, error in enumerate(ERRORS)
+    ]
+    instruments.append((Cause(CauseKind.TARGET_CONSTANT, 0), linear.columns((TARGET_CONSTANT,))))
+    sights = _sights(readings, linear)
+    tripods = _tripods(readings, linear)
+    tilts = (
+        [
+            (Cause(CauseKind.TILT, station), linear.columns(((station, 3), (station, 4))))
+            for station in stations[1:]
+        ]
+        if rules.levelled
+        else []
+    )
+    groups = (
+        (instruments, INSTRUMENT_FALSE_ALARM_RATE),
+        (sights, SIGHT_FALSE_ALARM_RATE),
+        (tripods, SIGHT_FALSE_ALARM_RATE),
+        (tilts, SIGHT_FALSE_ALARM_RATE),
+    )
+    return [
+        (cause, columns, float(chdtri(columns.shape[2], rate / len(group))))
+        for group, rate in groups
+        for cause, columns in group
+    ]
+
+
+def _sights(readings: TargetReadings, linear: Linearisation) -> list[tuple[Cause, FloatArray]]:
+    """Displacements of targets as measured by one station."""
+    residuals = np.sum(linear.project(linear.y[:, :, None]) ** 2, axis=(1, 2))
+    found = []
+    for target in range(len(readings.targets)):
+        of_target = readings.target == target
+        measured_by = np.unique(readings.station[of_target])
+        either = len(measured_by) == 2
+        for station in measured_by[1:] if either else measured_by:
+            rows = of_target & (readings.station == station)
+            if len(measured_by) > 1:
+                cause = Cause(CauseKind.SIGHT, int(station), target, either_station=either)
+                found.append((float(residuals[rows].sum()), cause, rows))
+    found.sort(key=lambda each: -each[0])
+    return [(cause, -linear.B * rows[:, None, None]) for _, cause, rows in found[:MAX_SIGHTS]]
+
+
+def _tripods(readings: TargetReadings, linear: Linearisation) -> list[tuple[Cause, FloatArray]]:
+    """Displacements and turns of a station after some of its readings, in their order."""
+    found = []
+    for station in range(len(readings.stations)):
+        own = np.flatnonzero(readings.station == station)
+        splits = 0
+        for place in range(1, len(own)):
+            before, after = own[:place], own[place:]
+            if readings.target[before[-1]] == readings.target[after[0]]:
+                continue
+            sizes = [len(np.unique(readings.target[rows])) for rows in (before, after)]
+            if min(sizes) < MIN_TARGETS_PER_ROUND or splits >= MAX_SIGHTS // 3:
+                continue
+            splits += 1
+            later = np.zeros(len(readings.station), dtype=bool)
+            later[after] = True
+            cause = Cause(CauseKind.TRIPOD, station, int(readings.target[after[0]]))
+            pose = tuple((station, component) for component in (0, 1, 2, 5))
+            found.append((cause, linear.columns(pose) * later[:, None, None]))
+    return found
+
+
+class _Allowed:
+    """Subsets in which the rejected targets of each station are few, and a tripod moved at most once."""
+
+    def __init__(self, readings: TargetReadings, causes: Sequence[Cause], *, limited: bool) -> None:
+        self._causes = causes
+        self._limited = limited
+        seen = [set(readings.target[readings.station == k].tolist()) for k in range(len(readings.stations))]
+        self._max_rejected = {k: max_rejected(len(seen[0] & seen[k])) for k in range(1, len(seen))}
+
+    def __call__(self, subset: Subset) -> bool:
+        chosen = [self._causes[row] for row in subset]
+        moved = [cause.station for cause in chosen if cause.kind is CauseKind.TRIPOD]
+        if len(set(moved)) < len(moved):
+            return False
+        return not self._limited or all(
+            len(rejected_targets(chosen, station)) <= limit for station, limit in self._max_rejected.items()
+        )
+
+
+def rejected_targets(causes: Collection[Cause], station: int) -> set[int]:
+    """Return the rows of the targets that a station, or the first one, measured wrong."""
+    return {
+        cause.target
+        for cause in causes
+        if cause.kind is CauseKind.SIGHT and cause.station in (0, station) and cause.target is not None
+    }
+
+
+def rejected_readings(readings: TargetReadings, causes: Collection[Cause]) -> NDArray[np.bool_]:
+    """Rows of the readings that causes of kind SIGHT leave out."""
+    rejected = np.zeros(len(readings.station), dtype=bool)
+    for cause in causes:
+        if cause.kind is CauseKind.SIGHT:
+            of_target = readings.target == cause.target
+            rejected |= of_target if cause.either_station else of_target & (readings.station == cause.station)
+    return rejected

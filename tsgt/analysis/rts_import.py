@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tsgt.analysis.calibration import solve_stations, target_residuals
+from tsgt.analysis.calibration import solve_stations, target_notes, target_residuals
 from tsgt.analysis.formats import read_target_file
 from tsgt.errors import GeometryError, InputFileError
 from tsgt.geometry import cartesian_to_polar, invert, raw_distance, transform_points
+from tsgt.geometry.polar import MIN_SINE
 from tsgt.model import IDENTITY4, PointMeasurement, PolarMeasurement, StationParameters
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.analysis.formats import PublishedTrack
-    from tsgt.model import Matrix4, Measurement
+    from tsgt.model import Matrix4, Measurement, SetupCovariance
 
 
 DEFAULT_TRACKED_PRISMS: Final[Mapping[int, int]] = {1: 1, 2: 2, 3: 3}
@@ -37,6 +38,7 @@ class SolvedStations:
 
     stations: tuple[StationParameters, ...]
     notes: tuple[str, ...]
+    covariance: SetupCovariance
 
 
 def stations_from_targets(
@@ -56,37 +58,38 @@ def stations_from_targets(
     solved = solve_stations(measured, target_constant_m=target_constant_m)
     notes = list(measured.skipped)
     for station in tracked:
-        if station == 1:
-            continue
-        if station not in solved:
+        if station != 1 and station not in solved.frames:
             raise InputFileError(
                 f"holds no targets of station {station}; its frame cannot be solved", path=path
             )
-        if not solved[station].consistent:
-            raise InputFileError(
-                f"the targets of station {station} are inconsistent; "
-                "tsgt calibrate targets shows their residuals; check the target constant too",
-                path=path,
-            )
-        notes += [
-            f"{path}: target {bad.name} of station {station} rejected" for bad in solved[station].rejected
-        ]
-        if solved[station].weak:
-            notes.append(
-                f"{path}: the frame of station {station} is weakly determined; tsgt calibrate targets shows the direction"
-            )
-    frames = {1: IDENTITY4} | {station: _matrix4(frame.T) for station, frame in solved.items()}
+    if not solved.consistent:
+        raise InputFileError(
+            "the targets are inconsistent; tsgt calibrate targets shows their residuals, names the suspects and leaves them "
+            "out on request; check the target constant too",
+            path=path,
+        )
+    notes += [f"{path}: {note}" for note in target_notes(solved)]
+    notes += [
+        f"{path}: the frame of station {station} is weakly determined; tsgt calibrate targets shows the direction"
+        for station, frame in solved.frames.items()
+        if station in tracked and frame.weak
+    ]
+    frames = {1: IDENTITY4} | {station: _matrix4(frame.T) for station, frame in solved.frames.items()}
+    errors = solved.instrument_errors()
     stations = (
         StationParameters(
             station=station,
             prism=prism,
             T_station1_station=frames[station],
             prism_constant_m=prism_constant_m,
-            targets=target_residuals(solved[station]) if station in solved else (),
+            atmospheric_ppm=errors[station].range_scale_ppm or 0.0,
+            vertical_index_rad=errors[station].vertical_index_rad or 0.0,
+            collimation_rad=errors[station].collimation_rad or 0.0,
+            targets=target_residuals(solved.frames[station]) if station in solved.frames else (),
         )
         for station, prism in tracked.items()
     )
-    return SolvedStations(tuple(stations), tuple(notes))
+    return SolvedStations(tuple(stations), tuple(notes), solved.covariance)
 
 
 def point_measurements(tracks: Sequence[PublishedTrack]) -> list[Measurement]:
@@ -125,7 +128,9 @@ def polar_measurements(
                 f"a position of prism {station.prism} is {nearest_mm:.1f} mm from station {station.station}, "
                 "closer than a station can measure: check that tracks and targets are of the same day"
             )
-        polar = np.stack([horizontal, zenith, slope], axis=-1)
+        # What the instrument reads in the first face.
+        horizontal = horizontal - station.collimation_rad / np.maximum(np.sin(zenith), MIN_SINE)
+        polar = np.stack([horizontal, zenith + station.vertical_index_rad, slope], axis=-1)
         measurements += [
             PolarMeasurement(
                 station=station.station,

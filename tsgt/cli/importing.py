@@ -22,7 +22,7 @@ from tsgt.analysis.rts_import import (
     polar_measurements,
     stations_from_targets,
 )
-from tsgt.analysis.setup_replacement import with_calibration
+from tsgt.analysis.setup_replacement import with_calibration, with_layout
 from tsgt.cli.options import (
     RECORDING_SUFFIXES,
     OutputFile,
@@ -34,14 +34,15 @@ from tsgt.cli.options import (
 )
 from tsgt.cli.output import print_json, refuse_overwrite
 from tsgt.cli.recordings import write_recording
-from tsgt.config import load_station_calibration
+from tsgt.config import load_prism_layout, load_station_calibration, setup_covariance
 from tsgt.model import Parameters, StationParameters
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from tsgt.model import Measurement
+    from tsgt.analysis.rts_import import SolvedStations
+    from tsgt.model import Measurement, PrismPosition, SetupCovariance
 
 PRISM_CONSTANT = "--prism-constant-mm"
 TARGET_CONSTANT = "--target-constant-mm"
@@ -109,14 +110,16 @@ def import_rts(
     layout = read_prisms(prisms)
     if targets is None:
         stations = tuple(StationParameters(station=k, prism=k) for k in (1, 2, 3))
+        parameters = _parameters(stations, layout, prisms)
         measurements = point_measurements(published)
     else:
-        stations = _solved_stations(targets, target_constant_mm, prism_constant_mm, DEFAULT_TRACKED_PRISMS)
-        measurements = polar_measurements(published, stations)
+        solved = _solved_stations(targets, target_constant_mm, prism_constant_mm, DEFAULT_TRACKED_PRISMS)
+        parameters = _parameters(solved.stations, layout, prisms, solved.covariance)
+        measurements = polar_measurements(published, solved.stations)
     write_recording(
         output,
         source=f"import rts: {' '.join(path.name for path in sources)}",
-        parameters=Parameters(stations=stations, prisms=layout),
+        parameters=parameters,
         records=measurements,
     )
     _print_summary(output, measurements, as_json=as_json)
@@ -166,7 +169,7 @@ def import_polar(
     layout = read_prisms(prisms, sorted({m.prism for m in measurements}))
     if targets is not None:
         solved = _solved_stations(targets, target_constant_mm, prism_constant_mm, tracked)
-        parameters = Parameters(stations=solved, prisms=layout)
+        parameters = _parameters(solved.stations, layout, prisms, solved.covariance)
     else:
         assert frames is not None  # noqa: S101 (one of them is given)
         constant = prism_constant_mm / 1e3
@@ -174,7 +177,7 @@ def import_polar(
             StationParameters(station=k, prism=p, prism_constant_m=constant) for k, p in tracked.items()
         )
         parameters = with_calibration(
-            Parameters(stations=tuple(stations), prisms=layout), load_station_calibration(frames), path=frames
+            _parameters(tuple(stations), layout, prisms), load_station_calibration(frames), path=frames
         )
     write_recording(
         output,
@@ -190,7 +193,7 @@ def _solved_stations(
     target_constant_mm: float | None,
     prism_constant_mm: float | None,
     tracked: Mapping[int, int],
-) -> tuple[StationParameters, ...]:
+) -> SolvedStations:
     """Solve the station frames from targets, and print notes on them."""
     if prism_constant_mm is None:
         raise click.UsageError(
@@ -208,7 +211,26 @@ def _solved_stations(
     )
     for note in solved.notes:
         click.echo(f"note: {note}", err=True)
-    return solved.stations
+    return solved
+
+
+def _parameters(
+    stations: tuple[StationParameters, ...],
+    layout: tuple[PrismPosition, ...],
+    prisms: Path,
+    covariance: SetupCovariance | None = None,
+) -> Parameters:
+    """Return parameters with the covariance of the frames, and of a prism layout from a set-up file."""
+    parameters = Parameters(
+        stations=stations,
+        prisms=layout,
+        setup_covariance=setup_covariance(
+            covariance, None, station_numbers=(s.station for s in stations), prism_numbers=()
+        ),
+    )
+    if prisms.suffix != ".toml":
+        return parameters
+    return with_layout(parameters, load_prism_layout(prisms), path=prisms)
 
 
 def _print_summary(output: Path, measurements: Sequence[Measurement], *, as_json: bool) -> None:

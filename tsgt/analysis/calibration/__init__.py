@@ -8,18 +8,33 @@ latencies with residuals, a check whether a station has moved, the next target t
 from tsgt.analysis.calibration.motion import CalibratedRecording, HeldOutComparison, calibrate_recording
 from tsgt.analysis.calibration.station_check import StationCheck, check_station
 from tsgt.analysis.calibration.target_collection import StationTarget, TargetCollection
-from tsgt.analysis.calibration.targets import mean_points, solve_prisms, solve_stations, target_residuals
+from tsgt.analysis.calibration.target_notes import suspect_exclusions, target_notes, unidentified_text
+from tsgt.analysis.calibration.targets import (
+    Exclusion,
+    TargetCalibration,
+    layout_covariance,
+    mean_points,
+    solve_prisms,
+    solve_stations,
+    target_residuals,
+)
 
 __all__ = [
     "CalibratedRecording",
+    "Exclusion",
     "HeldOutComparison",
     "StationCheck",
     "StationTarget",
+    "TargetCalibration",
     "TargetCollection",
     "calibrate_recording",
     "check_station",
+    "layout_covariance",
     "mean_points",
     "solve_prisms",
     "solve_stations",
+    "suspect_exclusions",
+    "target_notes",
     "target_residuals",
+    "unidentified_text",
 ]

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 from tsgt.analysis.calibration.targets import solve_stations
 from tsgt.analysis.formats import TargetFile, TargetMeasurement, read_partial_target_file
 from tsgt.errors import DegenerateGeometryError, InputFileError
+from tsgt.geometry.calibration import MIN_POINTS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from tsgt.geometry.calibration import FrameCalibration
+    from tsgt.analysis.calibration.targets import TargetCalibration
 
 HEADER = "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm"
 
@@ -94,16 +95,19 @@ class TargetCollection:
             [*self._comments, HEADER, *(_line(*key, measurement) for key, measurement in self._rows()), ""]
         )
 
-    def residuals(self, station: int) -> FrameCalibration | str:
-        """Solve the frame of a station from the present measurements; a sentence if that is not yet possible."""
+    def solution(self, station: int) -> TargetCalibration | str:
+        """Solve the frames from the present measurements, that of ``station`` among them; a sentence if not yet possible."""
         file = self._file()
         if station == 1 or not {1, station} <= file.measurements.keys():
             return "no targets in common with station 1 yet"
-        pair = dataclasses.replace(
-            file, measurements={number: file.measurements[number] for number in (1, station)}
-        )
+        of_first = set(file.measurements[1])
+        solvable = {
+            number: targets
+            for number, targets in file.measurements.items()
+            if number in (1, station) or len(of_first & set(targets)) >= MIN_POINTS
+        }
         try:
-            return solve_stations(pair, target_constant_m=0.0)[station]
+            return solve_stations(dataclasses.replace(file, measurements=solvable), target_constant_m=0.0)
         except (DegenerateGeometryError, InputFileError) as error:
             return str(error)
 

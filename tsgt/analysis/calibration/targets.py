@@ -3,50 +3,197 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.formats import InstrumentErrors
 from tsgt.errors import DegenerateGeometryError, InputFileError
 from tsgt.geometry import check_layout, corrected_distance, measurement_covariance, polar_to_cartesian
-from tsgt.geometry.calibration import PointSet, calibrate_frame, calibrate_prisms
-from tsgt.model import TARGET_NOISE, TargetResidual
+from tsgt.geometry.calibration import (
+    CONSISTENCY,
+    ERRORS,
+    InstrumentError,
+    PointSet,
+    TargetReadings,
+    calibrate_network,
+    calibrate_prisms,
+    checks,
+    station_frames,
+    unweighted_frames,
+)
+from tsgt.model import TARGET_NOISE, SetupCovariance, TargetResidual
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.analysis.formats import PrismFile, TargetFile, TargetMeasurement
-    from tsgt.geometry.calibration import FrameCalibration, PointName, PrismCalibration
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.calibration import (
+        Check,
+        Column,
+        ErrorEstimate,
+        FrameCalibration,
+        NetworkCalibration,
+        PointName,
+        PrismCalibration,
+    )
 
 REPEAT_LIMIT_M = 0.02  # From the mean; beyond is a mistake. An index error of 30" is within up to 130 m
 CAD_SIGMA_M = 0.001  # Per axis of a body point relative to CAD: machining, and the adhesive target
 
 
-def solve_stations(
-    file: TargetFile, *, target_constant_m: float, weighted: bool = True, levelled: bool = False
-) -> dict[int, FrameCalibration]:
-    """Solve ``T_station1_station`` of each station but 1 from the targets that it has in common with station 1.
+Exclusion = tuple[int | None, int]  # Numbers of a station, None: all, and a target
 
-    ``target_constant_m`` is added to slope distances without a constant of their own; ``weighted``, ``levelled``: see
-    :func:`tsgt.geometry.calibration.targets.calibrate_frame`. Raises DegenerateGeometryError if fewer than three targets are
-    in common or they lie in a line, InputFileError as :func:`mean_points`.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetCalibration:
+    """Station frames from targets, with all that is known about their quality."""
+
+    network: NetworkCalibration
+    frames: dict[int, FrameCalibration]  # By number of the stations but 1
+    covariance: SetupCovariance  # Of frames and instrument errors
+    applied: bool  # The frames are those of the corrected readings; False: unweighted, nothing is corrected
+
+    @property
+    def checks(self) -> list[Check]:
+        """Limits that decide whether the frames may be used; the same with and without weights."""
+        return checks(self.network)
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the frames may be used, be they weakly determined or not."""
+        return all(check.ok for check in self.checks if check.name in CONSISTENCY)
+
+    def errors(self, station: int) -> dict[InstrumentError, ErrorEstimate]:
+        """Instrument errors of a station by number."""
+        row = self.network.readings.stations.index(station)
+        return {error: self.network.errors[row, error] for error in ERRORS}
+
+    def instrument_errors(self) -> dict[int, InstrumentErrors]:
+        """Estimated errors that also hold for prisms, by station; the range constant is that of the targets."""
+        if not self.applied:
+            return {}
+        result = {}
+        for station in self.network.readings.stations:
+            values = {
+                error: estimate.value
+                for error, estimate in self.errors(station).items()
+                if estimate.estimated
+            }
+            scale = values.get(InstrumentError.RANGE_SCALE)
+            result[station] = InstrumentErrors(
+                vertical_index_rad=values.get(InstrumentError.VERTICAL_INDEX),
+                collimation_rad=values.get(InstrumentError.COLLIMATION),
+                range_scale_ppm=None if scale is None else 1e6 * scale,
+            )
+        return result
+
+
+def solve_stations(
+    file: TargetFile,
+    *,
+    target_constant_m: float,
+    weighted: bool = True,
+    levelled: bool = False,
+    exclude: Collection[Exclusion] = (),
+    max_residual_m: float | None = None,
+) -> TargetCalibration:
+    """Solve the frames of all stations but 1 jointly from the targets.
+
+    ``target_constant_m`` is added to slope distances without a constant of their own; ``weighted`` False: frames by Arun's
+    unweighted least squares, from the same targets; ``levelled``: heading and position only; ``max_residual_m``: leave out
+    sights until no residual is larger. Raises DegenerateGeometryError if fewer than three targets are in common with station
+    1 or they lie in a line, InputFileError as :func:`mean_points`, or if an exclusion names no measurement.
     """
-    points = {
-        station: mean_points(file.path, targets, target_constant_m, f"target {{}} of station {station}")
+    readings = target_readings(file, target_constant_m, exclude)
+    try:
+        network = calibrate_network(readings, TARGET_NOISE, levelled=levelled, max_residual_m=max_residual_m)
+    except DegenerateGeometryError as error:
+        raise DegenerateGeometryError(f"{file.path}: {error}") from error
+    frames, columns, covariance = station_frames(network), network.columns, network.covariance
+    if not weighted:
+        frames, columns, covariance = unweighted_frames(network, TARGET_NOISE)
+    return TargetCalibration(
+        network, frames, _setup_covariance(readings.stations, columns, covariance), weighted
+    )
+
+
+def target_readings(
+    file: TargetFile, constant_m: float, exclude: Collection[Exclusion] = ()
+) -> TargetReadings:
+    """Return the measurements of targets that two or more stations have measured, in the order of the file.
+
+    Raises InputFileError as :func:`mean_points` for measurements in the same face, or if an exclusion names none.
+    """
+    for station, target in exclude:
+        seen = file.measurements.values() if station is None else [file.measurements.get(station, {})]
+        if not any(target in targets for targets in seen):
+            whose = "" if station is None else f" of station {station}"
+            raise InputFileError(f"holds no measurement of target {target}{whose} to exclude", path=file.path)
+    rows = [
+        (measurement.line, station, target, measurement)
         for station, targets in file.measurements.items()
-    }
-    frames: dict[int, FrameCalibration] = {}
-    for station, seen in points.items():
-        if station == 1:
-            continue
-        try:
-            frames[station] = calibrate_frame(seen, points[1], weighted=weighted, levelled=levelled)
-        except DegenerateGeometryError as error:
-            raise DegenerateGeometryError(
-                f"{file.path}: station {station} against station 1: {error}"
-            ) from error
-    return frames
+        for target, repeats in targets.items()
+        if not {(None, target), (station, target)} & set(exclude)
+        for measurement in repeats
+    ]
+    rows.sort(key=lambda row: row[0])
+    for station, targets in file.measurements.items():
+        for face in (False, True):
+            same = {
+                target: [each for each in repeats if (each.zenith_angle_rad % math.tau > math.pi) == face]
+                for target, repeats in targets.items()
+            }
+            given = {target: repeats for target, repeats in same.items() if repeats}
+            if given:
+                mean_points(file.path, given, constant_m, f"target {{}} of station {station}")
+    common = {target for target, count in _station_counts(rows).items() if count > 1}
+    rows = [row for row in rows if row[2] in common]
+    stations = (1, *sorted(station for station in file.measurements if station != 1))
+    names = tuple(sorted(common))
+    return TargetReadings(
+        stations=stations,
+        targets=names,
+        station=np.array([stations.index(station) for _, station, _, _ in rows], dtype=np.intp),
+        target=np.array([names.index(target) for _, _, target, _ in rows], dtype=np.intp),
+        horizontal_rad=np.array([each.horizontal_angle_rad for *_, each in rows]),
+        zenith_rad=np.array([each.zenith_angle_rad for *_, each in rows]),
+        distance_m=np.array([each.slope_distance_m + _constant_m(each, constant_m) for *_, each in rows]),
+    )
+
+
+def _station_counts(rows: Sequence[tuple[int, int, int, TargetMeasurement]]) -> Counter[int]:
+    return Counter(target for target, _ in {(target, station) for _, station, target, _ in rows})
+
+
+def _constant_m(measurement: TargetMeasurement, default_m: float) -> float:
+    return default_m if measurement.constant_m is None else measurement.constant_m
+
+
+_COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", *ERRORS)
+
+
+def _setup_covariance(
+    stations: Sequence[int], columns: Sequence[Column], covariance: FloatArray
+) -> SetupCovariance:
+    """Keep frames and the instrument errors that also hold for prisms."""
+    kept = [
+        place
+        for place, (_, component) in enumerate(columns)
+        if component < len(_COMPONENTS) and _COMPONENTS[component] != InstrumentError.RANGE_CONSTANT
+    ]
+    matrix = covariance[np.ix_(kept, kept)]
+    return SetupCovariance(
+        components=tuple(
+            f"station{stations[row]}.{_COMPONENTS[component]}"
+            for row, component in (columns[place] for place in kept)
+        ),
+        matrix=tuple(tuple(map(float, row)) for row in (matrix + matrix.T) / 2),
+    )
 
 
 def target_residuals(frame: FrameCalibration) -> tuple[TargetResidual, ...]:
@@ -93,6 +240,14 @@ def solve_prisms(file: PrismFile, *, target_constant_m: float, prism_constant_m:
     return solved
 
 
+def layout_covariance(calibration: PrismCalibration) -> SetupCovariance:
+    """Return the joint covariance of all prisms; the error of the robot frame is common to them."""
+    prisms = calibration.prisms
+    names = tuple(f"prism{name}.{axis}" for name in prisms.names for axis in "xyz")
+    matrix = calibration.joint_covariance_m2
+    return SetupCovariance(components=names, matrix=tuple(tuple(map(float, row)) for row in matrix))
+
+
 def mean_points(
     path: Path,
     measured: Mapping[int, Sequence[TargetMeasurement]] | Mapping[str, Sequence[TargetMeasurement]],
@@ -110,10 +265,7 @@ def mean_points(
         # Both faces: the formula of face 1 yields the same point for the angles of face 2.
         h = np.array([measurement.horizontal_angle_rad for measurement in repeats])
         z = np.array([measurement.zenith_angle_rad for measurement in repeats])
-        constants = [
-            constant_m if measurement.constant_m is None else measurement.constant_m
-            for measurement in repeats
-        ]
+        constants = [_constant_m(measurement, constant_m) for measurement in repeats]
         d = np.array(
             [
                 corrected_distance(measurement.slope_distance_m, constant_m=constant, ppm=0.0)

@@ -74,7 +74,7 @@ def write_station_frames(
         if targets is not None and targets.get(station):
             table["targets"] = [_target(target) for target in targets[station]]
         tables[str(station)] = table
-    _write(path, {"kind": "station_frames", "stations": tables} | _covariance(covariance), comment)
+    _write(path, {"kind": "station_frames", "stations": tables}, covariance, comment)
 
 
 def write_prism_layout(
@@ -94,18 +94,14 @@ def write_prism_layout(
         str(prism): {"position_m": list(map(float, position)), "sigma_m": list(map(float, sigmas_m[prism]))}
         for prism, position in sorted(positions_m.items())
     }
-    _write(path, {"kind": "prism_layout", "prisms": tables} | _covariance(covariance), comment)
+    _write(path, {"kind": "prism_layout", "prisms": tables}, covariance, comment)
 
 
-def _covariance(covariance: SetupCovariance | None) -> dict[str, Any]:
-    if covariance is None:
-        return {}
-    return {
-        "covariance": {
-            "components": list(covariance.components),
-            "matrix": [list(row) for row in covariance.matrix],
-        }
-    }
+def _covariance_table(covariance: SetupCovariance) -> str:
+    """Return the TOML table, one row of the matrix per line."""
+    rows = "".join(f"    [{', '.join(map(repr, row))}],\n" for row in covariance.matrix)
+    names = ", ".join(f'"{name}"' for name in covariance.components)
+    return f"\n[covariance]\ncomponents = [{names}]\nmatrix = [\n{rows}]\n"
 
 
 def _target(fit: TargetResidual) -> dict[str, Any]:
@@ -120,8 +116,9 @@ def _to_mm(length_m: float) -> float:
     return round(1e3 * float(length_m), 3)
 
 
-def _write(path: Path, content: Mapping[str, Any], comment: str) -> None:
+def _write(path: Path, content: Mapping[str, Any], covariance: SetupCovariance | None, comment: str) -> None:
     # A file name in the comment may contain a line break.
     printable = "".join(character if character.isprintable() else "?" for character in comment)
     with write_atomically(path) as file:
-        file.write(f"# {printable}\n{tomli_w.dumps(content)}".encode())
+        table = "" if covariance is None else _covariance_table(covariance)
+        file.write(f"# {printable}\n{tomli_w.dumps(content)}{table}".encode())

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.calibration import TargetCollection
+from tsgt.analysis.calibration import TargetCalibration, TargetCollection, target_notes
 from tsgt.cli.calibrate.operator import Terminal
 from tsgt.cli.calibrate.session import target_session
 from tsgt.cli.options import OutputFile, constant_option, master_config_option
 from tsgt.cli.output import print_table
 from tsgt.clock import SystemClock
 from tsgt.config import MasterConfig, load
-from tsgt.geometry.calibration import FrameCalibration
 from tsgt.recording import write_atomically
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.calibration import StationTarget
     from tsgt.cli.calibrate.operator import Operator
     from tsgt.cli.calibrate.session import TargetSession
-    from tsgt.geometry.calibration import PointName
+    from tsgt.geometry.calibration import FrameCalibration, PointName
 
 KEYS = "Enter measures, s skips, r repeats the last one (r 3: target 3, r 2 3: of station 2), q quits"
 
@@ -142,13 +141,14 @@ def _write(collection: TargetCollection) -> None:
 
 def _print_progress(collection: TargetCollection, skipped: set[StationTarget], station: int) -> None:
     """Print the measurements of all stations, and the residuals of one station against station 1."""
-    solved = None if station == 1 else collection.residuals(station)
+    solved = None if station == 1 else collection.solution(station)
     residuals_mm: dict[PointName, str] = {}
-    if isinstance(solved, FrameCalibration):
+    if isinstance(solved, TargetCalibration):
+        frame = solved.frames[station]
         residuals_mm = {
             name: f"{1e3 * residual:.1f}"
-            for name, residual in zip(solved.used, solved.residuals_m, strict=True)
-        } | {bad.name: f"rejected, {1e3 * bad.prediction_error_m:.0f}" for bad in solved.rejected}
+            for name, residual in zip(frame.used, frame.residuals_m, strict=True)
+        } | {bad.name: f"rejected, {1e3 * bad.prediction_error_m:.0f}" for bad in frame.rejected}
 
     def state(cell: StationTarget) -> str:
         return str(collection.count(*cell)) if collection.count(*cell) else "X" if cell in skipped else "-"
@@ -163,15 +163,19 @@ def _print_progress(collection: TargetCollection, skipped: set[StationTarget], s
     ]
     stations = [f"station {number}" for number in collection.stations]
     print_table(["target", *stations, "" if solved is None else f"residual of {station}, mm"], rows)
-    if solved is not None:
-        click.echo(f"station {station}: {solved if isinstance(solved, str) else _verdict(solved)}")
+    if isinstance(solved, TargetCalibration):
+        click.echo(f"station {station}: {_verdict(solved.frames[station])}")
+        for note in target_notes(solved):
+            click.echo(f"note: {note}")
+    elif solved is not None:
+        click.echo(f"station {station}: {solved}")
 
 
-def _verdict(solved: FrameCalibration) -> str:
-    parts = [f"rms {1e3 * solved.rms_m:.1f} mm"]
-    if not solved.consistent:
+def _verdict(frame: FrameCalibration) -> str:
+    parts = [f"rms {1e3 * frame.rms_m:.1f} mm"]
+    if not frame.consistent:
         parts.append("the targets are inconsistent; one more target identifies the bad one")
-    parts += [f"target {bad.name} is an outlier, repeat it" for bad in solved.rejected]
-    if solved.weak:
+    parts += [f"target {bad.name} is an outlier, repeat it" for bad in frame.rejected]
+    if frame.weak:
         parts.append("the frame is weakly determined, add a target off the line of the others")
     return "; ".join(parts)

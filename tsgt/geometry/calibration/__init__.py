@@ -32,6 +32,7 @@ from tsgt.geometry.calibration.target_network import (
     TargetReadings,
 )
 from tsgt.geometry.calibration.targets import (
+    BODY_LIMITS,
     FALSE_ALARM_RATE,
     MIN_POINTS,
     STATION_LIMITS,
@@ -43,6 +44,7 @@ from tsgt.geometry.calibration.targets import (
 )
 
 __all__ = [
+    "BODY_LIMITS",
     "CONSISTENCY",
     "DATA_SHEET_SIGMA",
     "ERRORS",

@@ -1,7 +1,8 @@
 """Search for the few causes that explain a misfit: subsets of additional unknowns in a linear least-squares problem.
 
-Each cause is a block of columns. The subset minimises a penalised likelihood in which the scale of the noise is unknown, so
-that noise larger than stated is no cause of its own. Two causes that mask each other are found because all pairs are tried.
+Each cause is a block of columns. The subset minimises a penalised likelihood, in which the noise is as stated or, at a price,
+of unknown scale: noise larger than stated is not taken for many causes. Two causes that mask each other are found because all
+pairs are tried.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 Subset = tuple[int, ...]
 
-NOISE_SCALE_FREEDOM = 10.0  # Degrees of freedom of the stated noise's variance: how firmly it is taken
+NOISE_SCALE_PENALTY = 10.0  # By how much an unknown noise scale must lower twice the negative log-likelihood
 MAX_CAUSES = 8
 BLOCK = 4  # Columns of a cause, at most
 MIN_REDUNDANCY = (
@@ -72,19 +73,21 @@ class CauseSearch:
             self._vector[to] = gains[of]
             self._norms[to] = norms[of]
         self._chi_squared = float(residuals @ residuals)
-        self._freedom = NOISE_SCALE_FREEDOM + redundancy
+        self._redundancy = max(redundancy, 1)
         self._count = len(blocks)
         self._penalties = penalties
         self._allowed = allowed
 
     def costs(self, subsets: Sequence[Subset]) -> FloatArray:
-        """Penalised cost of subsets of one size: twice the negative log-likelihood, with the noise scale marginalised."""
+        """Penalised cost of subsets of one size: twice the negative log-likelihood, up to a constant."""
         index = np.array(subsets, dtype=np.intp).reshape(len(subsets), -1)
         matrix, vector = self._blocks(index)
         drop = np.sum(vector * np.linalg.solve(matrix, vector), axis=(1, 2)) if index.shape[1] else 0.0
-        rest = np.maximum(self._chi_squared - drop, 0.0)
-        cost: FloatArray = self._freedom * np.log(NOISE_SCALE_FREEDOM + rest)
-        return cost + self._penalties[index].sum(axis=1)
+        n = self._redundancy
+        rest = np.maximum(self._chi_squared - drop, 1e-9)
+        rescaled = n * (1.0 + np.log(np.maximum(rest / n, 1.0))) + NOISE_SCALE_PENALTY
+        cost: FloatArray = np.minimum(rest, rescaled) + self._penalties[index].sum(axis=1)
+        return cost
 
     def estimates(self, chosen: Subset) -> dict[int, FloatArray]:
         """Return the value (4,) of each chosen cause, in the units of its columns; unused columns are zero."""

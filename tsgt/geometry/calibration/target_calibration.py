@@ -14,6 +14,7 @@ from tsgt.geometry.calibration.target_causes import (
     Cause,
     CauseKind,
     SelectionRules,
+    outvoted,
     rejected_readings,
     select_causes,
 )
@@ -131,7 +132,7 @@ def calibrate_network(
     for _ in range(MAX_ROUNDS):
         previous = {cause.label for cause in causes}
         base = network.without_errors()
-        causes = select_causes(readings, linearise(readings, base, poses, noise), rules)
+        causes = outvoted(readings, select_causes(readings, linearise(readings, base, poses, noise), rules))
         kept = ~_left_out(readings, causes)
         network, linear = solve(readings.select(kept), base, poses | _freed(causes), noise)
         if {cause.label for cause in causes} == previous:
@@ -369,7 +370,7 @@ def _suspects(
     """Causes that a selection without limits finds beyond the selected ones, if there is a misfit at all."""
     if overall.p_value > MISFIT_LEVEL:
         return ()
-    rules = SelectionRules(0.0, levelled=len(poses) < 6 * (len(readings.stations) - 1), limited=False)
+    rules = SelectionRules(0.0, levelled=len(poses) < 6 * (len(readings.stations) - 1))
     base = network.without_errors()
     found = select_causes(readings, linearise(readings, base, poses, noise), rules)
     known = {cause.label for cause in causes}

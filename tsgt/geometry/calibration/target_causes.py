@@ -15,20 +15,27 @@ import numpy as np
 from scipy.special import chdtri
 
 from tsgt.geometry.calibration.cause_search import CauseSearch
-from tsgt.geometry.calibration.target_network import ERRORS, TARGET_CONSTANT
+from tsgt.geometry.calibration.target_network import ERRORS, TARGET_CONSTANT, InstrumentError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from tsgt.geometry.calibration.cause_search import Subset
-    from tsgt.geometry.calibration.target_network import InstrumentError, Linearisation, TargetReadings
+    from tsgt.geometry.calibration.target_network import Linearisation, TargetReadings
     from tsgt.geometry.rigid import FloatArray
 
 INSTRUMENT_FALSE_ALARM_RATE = 1e-3  # Of any instrument error, in a set that matches its noise model
 SIGHT_FALSE_ALARM_RATE = 1e-4  # Of any sight; the same for a tripod and a tilt
 MAX_SIGHTS = 60  # Candidates; of a larger set those with the largest residuals
+LARGEST_ERROR = {
+    InstrumentError.VERTICAL_INDEX: 2e-3,
+    InstrumentError.COLLIMATION: 2e-3,
+    InstrumentError.RANGE_SCALE: 3e-4,
+    InstrumentError.RANGE_CONSTANT: 0.05,
+}
+"""Beyond, something else is wrong: 2 mrad are 7 arcminutes, 300 ppm an atmosphere of 300 degrees, 50 mm more than any two
+reflectors differ."""
 MIN_TARGETS_PER_ROUND = 3  # Before and after a tripod moved, to tell it from wrong sights
 
 
@@ -73,13 +80,11 @@ class Cause:
 class SelectionRules:
     """What may be selected.
 
-    ``blunder_m``: smallest displacement of a sight; ``levelled``: look for tilts; ``limited``: reject at most so many targets
-    that the others still outvote them, :func:`max_rejected`.
+    ``blunder_m``: smallest displacement of a sight; ``levelled``: look for tilts.
     """
 
     blunder_m: float
     levelled: bool
-    limited: bool = True
 
 
 def max_rejected(targets: int) -> int:
@@ -104,31 +109,38 @@ def select_causes(
             redundancy=linear.redundancy,
             blocks=[range(a, b) for a, b in pairwise(ends)],
             penalties=np.array([penalty for _, _, penalty in candidates]),
-            allowed=_Allowed(readings, causes, limited=rules.limited),
+            allowed=lambda subset, causes=causes: _moved_once(causes[row] for row in subset),  # type: ignore[misc]
         )
         chosen = search.best()
         values = search.estimates(chosen)
-        small = [
-            row
-            for row in chosen
-            if causes[row].kind is CauseKind.SIGHT and np.linalg.norm(values[row]) < rules.blunder_m
-        ]
-        if not small:
+        implausible = {row for row in chosen if not _is_plausible(causes[row], values[row], rules)}
+        if not implausible:
             break
-        candidates = [each for row, each in enumerate(candidates) if row not in small]
+        candidates = [each for row, each in enumerate(candidates) if row not in implausible]
     alternatives = search.alternatives(chosen)
+    # Of causes that the readings do not tell apart: a tilt fails a check, where an instrument error would be applied; wrong
+    # sights are more frequent than tripods that move.
+    preferred = {CauseKind.INSTRUMENT: CauseKind.TILT, CauseKind.TRIPOD: CauseKind.SIGHT}
+    exchanged = tuple(
+        next(
+            (other for other in alternatives[row] if causes[other].kind is preferred.get(causes[row].kind)),
+            row,
+        )
+        for row in chosen
+    )
+    if exchanged != chosen and len(set(exchanged)) == len(exchanged):
+        chosen, values = exchanged, search.estimates(exchanged)
+        alternatives = search.alternatives(chosen)
 
-    def is_plausible(row: int, other: int) -> bool:
-        if causes[other].kind is not CauseKind.SIGHT:
-            return True
+    def is_alternative(row: int, other: int) -> bool:
         exchanged = tuple(other if each == row else each for each in chosen)
-        return bool(np.linalg.norm(search.estimates(exchanged)[other]) >= rules.blunder_m)
+        return _is_plausible(causes[other], search.estimates(exchanged)[other], rules)
 
     return tuple(
         replace(
             causes[row],
             value=values[row][: ends[row + 1] - ends[row]],
-            alternatives=tuple(causes[other] for other in alternatives[row] if is_plausible(row, other)),
+            alternatives=tuple(causes[other] for other in alternatives[row] if is_alternative(row, other)),
         )
         for row in chosen
     )
@@ -182,7 +194,7 @@ def _sights(readings: TargetReadings, linear: Linearisation) -> list[tuple[Cause
                 cause = Cause(CauseKind.SIGHT, int(station), target, either_station=either)
                 found.append((float(residuals[rows].sum()), cause, rows))
     found.sort(key=lambda each: -each[0])
-    return [(cause, -linear.B * rows[:, None, None]) for _, cause, rows in found[:MAX_SIGHTS]]
+    return [(cause, linear.B * rows[:, None, None]) for _, cause, rows in found[:MAX_SIGHTS]]
 
 
 def _tripods(readings: TargetReadings, linear: Linearisation) -> list[tuple[Cause, FloatArray]]:
@@ -207,23 +219,32 @@ def _tripods(readings: TargetReadings, linear: Linearisation) -> list[tuple[Caus
     return found
 
 
-class _Allowed:
-    """Subsets in which the rejected targets of each station are few, and a tripod moved at most once."""
+def _is_plausible(cause: Cause, value: FloatArray, rules: SelectionRules) -> bool:
+    size = float(np.linalg.norm(value[:3]))
+    if cause.kind is CauseKind.SIGHT:
+        return size >= rules.blunder_m
+    if cause.kind is CauseKind.TARGET_CONSTANT:
+        return size <= LARGEST_ERROR[InstrumentError.RANGE_CONSTANT]
+    return cause.error is None or size <= LARGEST_ERROR[cause.error]
 
-    def __init__(self, readings: TargetReadings, causes: Sequence[Cause], *, limited: bool) -> None:
-        self._causes = causes
-        self._limited = limited
-        seen = [set(readings.target[readings.station == k].tolist()) for k in range(len(readings.stations))]
-        self._max_rejected = {k: max_rejected(len(seen[0] & seen[k])) for k in range(1, len(seen))}
 
-    def __call__(self, subset: Subset) -> bool:
-        chosen = [self._causes[row] for row in subset]
-        moved = [cause.station for cause in chosen if cause.kind is CauseKind.TRIPOD]
-        if len(set(moved)) < len(moved):
-            return False
-        return not self._limited or all(
-            len(rejected_targets(chosen, station)) <= limit for station, limit in self._max_rejected.items()
-        )
+def _moved_once(causes: Iterable[Cause]) -> bool:
+    """No tripod moved twice."""
+    moved = [cause.station for cause in causes if cause.kind is CauseKind.TRIPOD]
+    return len(set(moved)) == len(moved)
+
+
+def outvoted(readings: TargetReadings, causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """Return the causes without the sights of stations of which too many targets are wrong to reject them."""
+    refused: set[int] = set()
+    for station in range(1, len(readings.stations)):
+        of_first, of_other = (set(readings.target[readings.station == row].tolist()) for row in (0, station))
+        rejected = rejected_targets(causes, station)
+        if len(rejected) > max_rejected(len(of_first & of_other)):
+            refused |= rejected
+    return tuple(
+        cause for cause in causes if cause.kind is not CauseKind.SIGHT or cause.target not in refused
+    )
 
 
 def rejected_targets(causes: Collection[Cause], station: int) -> set[int]:

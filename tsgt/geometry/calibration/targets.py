@@ -115,6 +115,7 @@ class PrismCalibration:
     # Positions and covariances in the robot frame; each covariance contains the error of the body fit, which is
     # common to all
     prisms: PointSet
+    joint_covariance_m2: FloatArray  # (3 n, 3 n) of all prisms in their order
 
 
 def calibrate_frame(
@@ -198,8 +199,14 @@ def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> Pr
         rotation @ prisms.covariances_m2 @ rotation.T
         + jacobian @ frame.covariance @ jacobian.transpose(0, 2, 1)
     )
+    stacked = jacobian.reshape(-1, 6)
+    joint = stacked @ frame.covariance @ stacked.T
+    for each, noise in enumerate(rotation @ prisms.covariances_m2 @ rotation.T):
+        joint[3 * each : 3 * each + 3, 3 * each : 3 * each + 3] += noise
     return PrismCalibration(
-        body=frame, prisms=PointSet(prisms.names, transform_points(frame.T, prisms.points_m), covariances)
+        body=frame,
+        prisms=PointSet(prisms.names, transform_points(frame.T, prisms.points_m), covariances),
+        joint_covariance_m2=(joint + joint.T) / 2,
     )
 
 

@@ -43,7 +43,7 @@ def written(folder: Path, text: str) -> Path:
 
 def test_documented_target_file_is_solved(tmp_path: Path) -> None:
     """The example of the reference page, in both faces, gives the frame from which it was made."""
-    frames = solve_stations(read_target_file(documented(0, tmp_path)), target_constant_m=0.0)
+    frames = solve_stations(read_target_file(documented(0, tmp_path)), target_constant_m=0.0).frames
     assert list(frames) == [2]
     assert frames[2].used == (1, 2, 3, 4)
     np.testing.assert_allclose(frames[2].T[:3, 3], [2.0, -1.5, 0.1], atol=0.003)
@@ -51,7 +51,7 @@ def test_documented_target_file_is_solved(tmp_path: Path) -> None:
 
 def test_documented_marker_file_is_solved(tmp_path: Path) -> None:
     """The excerpt of the authors' file on the reference page is recognised by its header."""
-    frames = solve_stations(read_target_file(documented(1, tmp_path)), target_constant_m=0.01)
+    frames = solve_stations(read_target_file(documented(1, tmp_path)), target_constant_m=0.01).frames
     assert frames[2].used == (1, 6, 7)
     assert frames[2].rms_m < 0.002
 
@@ -78,8 +78,8 @@ def test_angles_are_read_in_each_unit(tmp_path: Path, unit: str, circle: float) 
     assert measurement.line == 3
 
 
-def test_two_faces_cancel_an_index_error(tmp_path: Path) -> None:
-    """Both faces with a zenith index error of 0.01 degrees give the frame without it."""
+def test_index_error_is_estimated_from_two_faces(tmp_path: Path) -> None:
+    """Both faces with a zenith index error of 0.01 degrees give the error, and the frame without it."""
     lines = []
     for line in GOOD.splitlines():
         station, target, h, z, d = line.split(",")
@@ -88,12 +88,14 @@ def test_two_faces_cancel_an_index_error(tmp_path: Path) -> None:
             f"{station},{target},{(float(h) + 180) % 360!r},{360 - float(z) + 0.01!r},{d}",
         ]
     plain, both = (
-        solve_stations(read_target_file(written(tmp_path, text)), target_constant_m=0.0)[2]
+        solve_stations(read_target_file(written(tmp_path, text)), target_constant_m=0.0)
         for text in (f"{HEADER}\n{GOOD}", "\n".join([HEADER, *lines]))
     )
-    np.testing.assert_allclose(both.T, plain.T, atol=1e-6)
-    # Two measurements of each point are worth twice as much.
-    np.testing.assert_allclose(both.covariance, plain.covariance / 2, rtol=1e-3)
+    np.testing.assert_allclose(both.frames[2].T, plain.frames[2].T, atol=1e-5)
+    for errors in both.instrument_errors().values():
+        assert errors.vertical_index_rad == pytest.approx(math.radians(0.01), rel=0.01)
+        assert errors.collimation_rad is None
+    assert plain.instrument_errors()[2].vertical_index_rad is None
 
 
 def test_constant_in_the_file_overrides_the_default(tmp_path: Path) -> None:
@@ -104,7 +106,7 @@ def test_constant_in_the_file_overrides_the_default(tmp_path: Path) -> None:
         target_constant_m=0.01,
     )
     common = solve_stations(read_target_file(written(tmp_path, f"{HEADER}\n{GOOD}")), target_constant_m=0.01)
-    np.testing.assert_allclose(own[2].T, common[2].T, atol=1e-12)
+    np.testing.assert_allclose(own.frames[2].T, common.frames[2].T, atol=1e-12)
 
 
 def test_comments_blank_lines_and_byte_order_mark_are_ignored(tmp_path: Path) -> None:

@@ -193,9 +193,9 @@ async def test_collected_targets_solve_the_frames(tmp_path: Path, speaks: Speaks
     assert file.measurements[2][1][0].constant_m == 0.01
     # The constant is part of the file; the instruments here need none, so distances are 10 mm long.
     for station in (2, 3):
-        solved = collection.residuals(station)
+        solved = collection.solution(station)
         assert not isinstance(solved, str)
-        assert np.linalg.norm(solved.T[:3, 3] - FRAMES[station - 1][:3, 3]) < 0.01
+        assert np.linalg.norm(solved.frames[station].T[:3, 3] - FRAMES[station - 1][:3, 3]) < 0.01
 
 
 @pytest.mark.parametrize("speaks", BOTH)

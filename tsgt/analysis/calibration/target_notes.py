@@ -1,0 +1,275 @@
+"""What the residuals of targets look like, in sentences: the cause, its size with uncertainty, and what repairs it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.calibration import DATA_SHEET_SIGMA, ERRORS, CauseKind, InstrumentError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from tsgt.analysis.calibration.targets import TargetCalibration
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.calibration import Cause, FitQuality
+
+NOISE_LEVEL = 1e-3  # Probability by chance of a misfit that is called noise larger than stated
+SPEC_FACTOR = 3.0  # Data sheet's sigmas beyond which an estimated instrument error is reported as one
+DOMINANT = 0.95  # Share of a displacement's length in one direction that makes it an error of one reading
+CONFUSED_M = 0.02  # Distance from another target's place below which the numbers were confused
+UNEVEN = 1.3  # Ratio of noise scales beyond which the largest is named
+
+_NAMES = {
+    InstrumentError.VERTICAL_INDEX: ("a vertical index error", "mrad", 1e3),
+    InstrumentError.COLLIMATION: ("a collimation error", "mrad", 1e3),
+    InstrumentError.RANGE_SCALE: ("a scale error of the distances", "ppm", 1e6),
+    InstrumentError.RANGE_CONSTANT: ("a constant error of the distances", "mm", 1e3),
+}
+_REPAIRS = {
+    InstrumentError.VERTICAL_INDEX: "adjust the instrument, or measure in both faces",
+    InstrumentError.COLLIMATION: "adjust the instrument, or measure in both faces",
+    InstrumentError.RANGE_SCALE: "check its atmospheric correction",
+    InstrumentError.RANGE_CONSTANT: "check the reflector type set in the instrument",
+}
+
+
+def target_notes(calibration: TargetCalibration) -> list[str]:
+    """Return one sentence per finding, the most important first."""
+    network = calibration.network
+    notes = _rejected(calibration)
+    notes += [
+        _excess_text(calibration, cause)
+        for cause in network.causes
+        if cause.kind is CauseKind.INSTRUMENT and _is_beyond_data_sheet(calibration, cause)
+    ]
+    for cause in network.causes:
+        if cause.kind is CauseKind.TARGET_CONSTANT:
+            value_mm = 1e3 * network.network.target_constant_m
+            done = "corrected here" if calibration.applied else "not corrected with --weights none"
+            notes.append(
+                f"all stations: the distances to the targets look {-value_mm:+.1f} mm wrong: check the constant of the "
+                f"targets (add {value_mm:+.1f} mm to --target-constant-mm); {done}"
+            )
+        if cause.kind is CauseKind.TRIPOD:
+            notes.append(_tripod_text(calibration, cause))
+    suspects = [
+        f"{_sight(calibration, cause)} is {1e3 * cause.size_m:.1f} mm off: suspect but kept; "
+        f"--exclude {exclusion(calibration, cause)} leaves it out"
+        for cause in network.suspects
+        if cause.kind is CauseKind.SIGHT
+    ]
+    if network.overall.p_value < NOISE_LEVEL:
+        notes.append(_noise_text(calibration, has_suspects=bool(suspects)))
+    return notes + suspects
+
+
+def suspect_exclusions(calibration: TargetCalibration) -> list[str]:
+    """Return what ``--exclude`` would leave out: sights that are suspect, or not told apart from another cause."""
+    network = calibration.network
+    unidentified = [
+        each
+        for cause in network.unidentified
+        for each in (cause, *cause.alternatives)
+        if each.kind is CauseKind.SIGHT
+    ]
+    found = [cause for cause in (*unidentified, *network.suspects) if cause.kind is CauseKind.SIGHT]
+    return list(dict.fromkeys(exclusion(calibration, cause) for cause in found))
+
+
+def exclusion(calibration: TargetCalibration, cause: Cause) -> str:
+    """Return the value of ``--exclude`` for a sight."""
+    station, target = _numbers(calibration, cause)
+    return f"{target}" if cause.either_station else f"{station}:{target}"
+
+
+def unidentified_text(calibration: TargetCalibration) -> str:
+    """Return which causes the readings do not tell apart."""
+    return "; ".join(
+        " or ".join(dict.fromkeys(_name(calibration, each) for each in (cause, *cause.alternatives)))
+        for cause in calibration.network.unidentified
+    )
+
+
+def _rejected(calibration: TargetCalibration) -> list[str]:
+    sights = [cause for cause in calibration.network.causes if cause.kind is CauseKind.SIGHT]
+    notes = []
+    for cause in sights:
+        same = [other for other in sights if other.target == cause.target]
+        station, target = _numbers(calibration, cause)
+        if len(same) > 1:
+            if cause is same[0]:
+                notes.append(
+                    f"target {target} rejected: no two stations agree on its place; it moved between the rounds, or its "
+                    "number was given to several targets; measure it again with all stations"
+                )
+            continue
+        size = f"{1e3 * cause.size_m:.1f} mm"
+        if cause.either_station:
+            notes.append(
+                f"target {target} rejected: stations {_listed(_stations_of(calibration, cause))} disagree on its place by {size}, and "
+                f"no other station measured it{_confused(calibration, cause)}; measure it again"
+            )
+            continue
+        others = [s for s in _stations_of(calibration, cause) if s != station]
+        notes.append(
+            f"station {station}: target {target} rejected: {size} from the place on which stations "
+            f"{_listed(others)} agree ({_components_text(calibration, cause)}): {_verdict(calibration, cause)}; "
+            "measure it again"
+        )
+    return notes
+
+
+def _verdict(calibration: TargetCalibration, cause: Cause) -> str:
+    """Say whether one reading is wrong or the target has moved."""
+    if confused := _confused(calibration, cause):
+        return confused.removeprefix(", ")
+    shares = np.abs(_components(calibration, cause)) / cause.size_m
+    readings = ("distance", "horizontal angle", "vertical angle")
+    for share, reading in zip(shares, readings, strict=True):
+        if share > DOMINANT:
+            return f"the station erred, its {reading} is wrong"
+    return "the target moved between these measurements, or another point was aimed at"
+
+
+def _confused(calibration: TargetCalibration, cause: Cause) -> str:
+    network = calibration.network
+    assert cause.value is not None  # noqa: S101 (selected)
+    assert cause.target is not None  # noqa: S101 (of a sight)
+    points = network.network.points_m
+    # A place that a station measured wrong differs by the displacement, with the sign of the sight.
+    distances = np.linalg.norm(points - (points[cause.target] + cause.value), axis=1)
+    distances[cause.target] = np.inf
+    nearest = int(np.argmin(distances))
+    if distances[nearest] > CONFUSED_M:
+        return ""
+    return f", this is the place of target {network.readings.targets[nearest]}"
+
+
+def _excess_text(calibration: TargetCalibration, cause: Cause) -> str:
+    assert cause.error is not None  # noqa: S101 (of an instrument)
+    station = calibration.network.readings.stations[cause.station]
+    what, unit, factor = _NAMES[cause.error]
+    estimate = calibration.errors(station)[cause.error]
+    others = sorted(
+        {
+            calibration.network.readings.stations[other.station]
+            for other in cause.alternatives
+            if other.kind is CauseKind.INSTRUMENT and other.error is cause.error
+        }
+    )
+    which = f"station {station}" if not others else f"station {station} or {_listed(others, 'or')}"
+    if not calibration.applied:
+        done = "not applied with --weights none"
+    elif cause.error is InstrumentError.RANGE_CONSTANT:
+        done = "applied to the targets only: the constant of the prisms may differ"
+    else:
+        done = "applied"
+    return (
+        f"{which}: the residuals look like {what} of {factor * estimate.value:.3g} {unit} (sigma {factor * estimate.sigma:.2g}), "
+        f"{done}; {_REPAIRS[cause.error]}"
+    )
+
+
+def _tripod_text(calibration: TargetCalibration, cause: Cause) -> str:
+    assert cause.value is not None  # noqa: S101 (selected)
+    station, target = _numbers(calibration, cause)
+    before = _before(calibration, cause)
+    return (
+        f"station {station}: the tripod looks moved by {1e3 * cause.size_m:.1f} mm and turned by "
+        f"{1e3 * abs(float(cause.value[3])):.2f} mrad before target {target} was measured; measure the targets before it "
+        f"again, or leave them out: --exclude {','.join(f'{station}:{each}' for each in before)}"
+    )
+
+
+def _noise_text(calibration: TargetCalibration, *, has_suspects: bool) -> str:
+    network = calibration.network
+    quality = network.overall
+    scales = dict(
+        zip(("along the line of sight", "horizontal", "vertical"), network.by_component, strict=True)
+    )
+    stations = {
+        f"station {station}": each
+        for station, each in zip(network.readings.stations, network.by_station, strict=True)
+    }
+    parts = [name for part in (scales, stations) if (name := _largest(part))]
+    mostly = f", mostly {' and '.join(parts)}" if parts else ""
+    reason = "with the suspects below" if has_suspects else "noise larger than stated, or many small errors"
+    return (
+        f"the residuals are {quality.noise_scale:.2f} times the stated noise (chi-square {quality.chi_squared:.1f} of "
+        f"{quality.redundancy:.0f} degrees of freedom, p {quality.p_value:.1g}){mostly}: {reason}; the sigmas are "
+        "scaled by it"
+    )
+
+
+def _largest(qualities: dict[str, FitQuality]) -> str:
+    """Return the part with the largest noise scale, if it stands out."""
+    ordered = sorted(qualities, key=lambda name: -qualities[name].noise_scale)
+    first, second = (qualities[name].noise_scale for name in ordered[:2])
+    return f"{ordered[0]} ({first:.1f} times)" if first > UNEVEN * second else ""
+
+
+def _before(calibration: TargetCalibration, cause: Cause) -> list[int]:
+    """Numbers of the targets that a station measured before its tripod moved."""
+    readings = calibration.network.readings
+    own = readings.target[readings.station == cause.station].tolist()
+    return [readings.targets[target] for target in dict.fromkeys(own[: own.index(cause.target)])]
+
+
+def _is_beyond_data_sheet(calibration: TargetCalibration, cause: Cause) -> bool:
+    assert cause.error is not None  # noqa: S101 (of an instrument)
+    value = calibration.network.network.errors[cause.station, ERRORS.index(cause.error)]
+    return bool(abs(value) > SPEC_FACTOR * DATA_SHEET_SIGMA[cause.error])
+
+
+def _name(calibration: TargetCalibration, cause: Cause) -> str:
+    if cause.kind is CauseKind.TARGET_CONSTANT:
+        return "a wrong constant of all targets"
+    if cause.kind is CauseKind.INSTRUMENT and cause.error is not None:
+        station = calibration.network.readings.stations[cause.station]
+        return f"{_NAMES[cause.error][0]} of station {station}"
+    if cause.kind is CauseKind.SIGHT:
+        return _sight(calibration, cause)
+    return f"a {cause.kind.value} of station {calibration.network.readings.stations[cause.station]}"
+
+
+def _sight(calibration: TargetCalibration, cause: Cause) -> str:
+    station, target = _numbers(calibration, cause)
+    return f"target {target}" if cause.either_station else f"target {target} of station {station}"
+
+
+def _numbers(calibration: TargetCalibration, cause: Cause) -> tuple[int, int]:
+    readings = calibration.network.readings
+    assert cause.target is not None  # noqa: S101 (of a sight or a tripod)
+    return readings.stations[cause.station], readings.targets[cause.target]
+
+
+def _stations_of(calibration: TargetCalibration, cause: Cause) -> list[int]:
+    """Numbers of the stations that measured the cause's target."""
+    readings = calibration.network.readings
+    rows = sorted(set(readings.station[readings.target == cause.target].tolist()))
+    return [readings.stations[row] for row in rows]
+
+
+def _components(calibration: TargetCalibration, cause: Cause) -> FloatArray:
+    """(3,) displacement of a sight along, clockwise and upwards across the line of sight."""
+    network = calibration.network.network
+    assert cause.value is not None  # noqa: S101 (selected)
+    line = network.points_m[cause.target] - network.translation_m[cause.station]
+    along = line / np.linalg.norm(line)
+    across = np.cross(along, [0.0, 0.0, 1.0])
+    across /= max(float(np.linalg.norm(across)), 1e-9)
+    axes = np.stack([along, across, np.cross(across, along)])
+    components: FloatArray = axes @ cause.value
+    return components
+
+
+def _components_text(calibration: TargetCalibration, cause: Cause) -> str:
+    along, across, up = 1e3 * _components(calibration, cause)
+    return f"along the line of sight {along:+.1f}, clockwise {across:+.1f}, up {up:+.1f} mm"
+
+
+def _listed(numbers: Sequence[int], word: str = "and") -> str:
+    *most, last = map(str, numbers)
+    return f"{', '.join(most)} {word} {last}" if most else last

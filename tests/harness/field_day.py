@@ -409,7 +409,7 @@ def _measure_targets(
 
 def calibrated(day: FieldDay) -> Recording:
     """Return the recording with the station frames that its targets give."""
-    solved = solve_stations(day.targets, target_constant_m=CONSTANT_M)
+    solved = solve_stations(day.targets, target_constant_m=CONSTANT_M).frames
     stations = tuple(
         station
         if station.station == 1

@@ -20,16 +20,9 @@ if TYPE_CHECKING:
 
 _VALID_SHARE = 0.95
 _IN_GAPS = 0.05
-_STATIC_BIAS_MM = 3.0
 _MOVING_MM = 10.0
 _SIGMA_MM = 10.0
-_TIMING_SHARE = 2.0
 _BOUND_MM = 3.0
-_RESIDUAL_MEAN = 0.5
-_RESIDUAL_STD = 1.5
-_NOISE_SCALE = (0.5, 2.0)
-_OUTLIERS = 0.01
-_MIN_RESIDUALS = 30
 _LARGE_EFFECT_MM = 10.0
 _NEES = (3.0, 12.0)
 
@@ -59,7 +52,7 @@ def verdicts(findings: Findings) -> list[Verdict]:
         *_stations(findings),
         *_times(findings),
         *_distances(findings),
-        *_residuals(findings),
+        *_motion(findings),
         *_reference(findings),
     ]
     order = (Level.BAD, Level.CARE, Level.GOOD)
@@ -192,71 +185,19 @@ def _distances(f: Findings) -> Iterator[Verdict]:
             f"{why}: errors of layout, frames and prism constants cannot be separated from timing errors.",
             "Stop for some seconds now and then.",
         )
-    for pair in f.inter_prism.static if f.diagnosis is None else ():
-        figures = pair.statistics()
-        bias_mm = figures.mean - figures.reference
-        if abs(bias_mm) > _STATIC_BIAS_MM:
-            yield Verdict(
-                Level.CARE,
-                f"While the robot stood still, the mean distance between the prisms {pair.name} deviates by {bias_mm:+.1f} mm from "
-                "the prism layout.",
-                "Check the prism layout, the prism constants and the station frames: `tsgt calibrate motion`.",
-            )
     moving_mm = float(np.mean([figures.mean_abs_error for figures in moving]))
     yield Verdict(
         Level.GOOD if moving_mm <= _MOVING_MM else Level.CARE,
         f"The measured distances between the prisms differ from the prism layout by {moving_mm:.1f} mm on average.",
     )
-    if static and f.diagnosis is None:
-        static_std_mm = float(np.mean([figures.std for figures in static]))
-        std_mm = float(np.mean([figures.std for figures in moving]))
-        if std_mm > _TIMING_SHARE * static_std_mm:
-            yield Verdict(
-                Level.CARE,
-                f"The standard deviation of the distances between the prisms is {std_mm:.1f} mm over the whole recording, but "
-                f"{static_std_mm:.1f} mm while the robot stood still: the difference is due to linear interpolation between "
-                "measurements, timestamps and latencies.",
-                "Calibrate the latencies: `tsgt calibrate motion`.",
-            )
 
 
-def _residuals(f: Findings) -> Iterator[Verdict]:
-    if f.continuous is None:
-        return
-    scale = f.continuous.motion.noise_scale
-    if not f.continuous.motion.tuned:
+def _motion(f: Findings) -> Iterator[Verdict]:
+    if f.continuous is not None and not f.continuous.motion.tuned:
         yield Verdict(
             Level.CARE,
             "There are too few measurements to estimate motion prior and noise scale: both are those of the recording.",
             "Record longer than some seconds.",
-        )
-    if f.diagnosis is not None:
-        return
-    if f.continuous.motion.tuned and not _NOISE_SCALE[0] <= scale <= _NOISE_SCALE[1]:
-        yield Verdict(
-            Level.CARE,
-            f"The noise of the measurements is {scale:.2g} times the stated noise of the instruments.",
-        )
-    sufficient = [each for axes in f.residuals.values() for each in axes.values() if each.n >= _MIN_RESIDUALS]
-    abnormal = [
-        f"station {station} {axis.replace('_', ' ')} (mean {each.mean:+.1f}, std {each.std:.1f})"
-        for station, axes in f.residuals.items()
-        for axis, each in axes.items()
-        if each.n >= _MIN_RESIDUALS and (abs(each.mean) > _RESIDUAL_MEAN or each.std > _RESIDUAL_STD)
-    ]
-    if abnormal:
-        yield Verdict(
-            Level.CARE,
-            f"Residuals exceed the noise: {', '.join(abnormal)}. A mean other than 0 indicates an error of a frame or a latency.",
-        )
-    elif sufficient:
-        yield Verdict(Level.GOOD, "The residuals of all stations are consistent with their noise.")
-    n = len(f.continuous.sources)
-    if len(f.outliers) > _OUTLIERS * n:
-        yield Verdict(
-            Level.CARE,
-            f"{len(f.outliers)} of {n} measurements were rejected as outliers.",
-            "See the list of outliers: reflections, a prism of another station, a lock that drifts.",
         )
 
 

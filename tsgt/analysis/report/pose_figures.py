@@ -83,13 +83,13 @@ def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
 
-def draw_difference(figure: Figure, difference: Difference, axis: TimeAxis) -> None:
-    """Draw the difference between the poses of the two estimators."""
+def draw_difference(figure: Figure, difference: Difference, axis: TimeAxis, point: str) -> None:
+    """Draw the difference between the poses of the two estimators, positions at a point of this name."""
     axes = figure.subplots(2, 1, sharex=True)
     time, position, rotation = _with_gaps(difference)
     curve(axes[0], axis.of(time), 1e3 * position, 1, label=None, dashes=False)
     curve(axes[1], axis.of(time), np.degrees(rotation), 1, label=None, dashes=False)
-    axes[0].set_ylabel("position (mm)")
+    axes[0].set_ylabel(f"{point}\n(mm)")
     axes[1].set_ylabel("rotation (deg)")
     for panel in axes:
         panel.set_ylim(bottom=0.0)
@@ -130,7 +130,7 @@ def draw_perturbation(figure: Figure, study: Sequence[Perturbation], measured_m:
     position_mm = 1e3 * np.array([(*each.position_std_m, each.position_norm_mean_m) for each in study])
     rotation_deg = np.degrees([(*each.euler_std_rad, each.rotation_norm_mean_rad) for each in study])
     panels = (
-        (axes[0], position_mm, ("x", "y", "z", "mean length"), "position error (mm)"),
+        (axes[0], position_mm, ("x", "y", "z", "mean length"), "error of the prisms' centroid (mm)"),
         (axes[1], rotation_deg, ("roll", "pitch", "yaw", "mean angle"), "rotation error (deg)"),
     )
     for panel, values, names, label in panels:

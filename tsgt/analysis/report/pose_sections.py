@@ -86,7 +86,7 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
                 f"Distance between the two positions of {f.point}, and angle between the two rotations. It is not an error, but "
                 "where it is large one of them is wrong.",
                 panels_height_mm(2),
-                lambda figure: draw.draw_difference(figure, difference, axis),
+                lambda figure: draw.draw_difference(figure, difference, axis, f.point),
             )
         )
     return Section(

@@ -58,6 +58,7 @@ def compare_live(
 def print_live(found: LiveComparison, parameters: Parameters) -> None:
     """Print the errors as tables, positions at the reference point."""
     against = "the reference" if found.against == "reference" else "the post-processed trajectory"
+    point = parameters.reference_point.name
     click.echo(f"\nStreamed poses against {against}, at {point_label(parameters.reference_point)}")
     rows = []
     for kind, each in found.kinds.items():
@@ -77,7 +78,16 @@ def print_live(found: LiveComparison, parameters: Parameters) -> None:
         )
     print_table(
         [
-            *("kind", "n", "valid", "rms mm", "p95 mm", "centroid rms mm", "rms deg", "NEES (6)"),
+            *(
+                "kind",
+                "n",
+                "valid",
+                f"{point} rms mm",
+                f"{point} p95 mm",
+                "centroid rms mm",
+                "rms deg",
+                "NEES (6)",
+            ),
             *("beyond limits: mm", "deg", "beyond 3 sigma: mm", "deg"),
         ],
         rows,
@@ -96,7 +106,8 @@ def print_live(found: LiveComparison, parameters: Parameters) -> None:
         for kind, each in found.kinds.items()
         for bin_ in each.errors.by_age
     ]
-    print_table(["kind", "age ms", "n", "rms mm", "median mm", "p95 mm", "rms deg", "NEES (6)"], rows)
+    of_point = [f"{point} {figure} mm" for figure in ("rms", "median", "p95")]
+    print_table(["kind", "age ms", "n", *of_point, "rms deg", "NEES (6)"], rows)
 
 
 def _compare(poses: StreamedPoses, kind: Kind, true: Reference, parameters: Parameters) -> LivePoses:

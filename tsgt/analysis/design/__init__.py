@@ -18,6 +18,7 @@ from tsgt.analysis.design.perturbation import (
     equivalent_noise,
     first_order_sigmas,
     perturbation_study,
+    perturbed,
 )
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "first_order_sigmas",
     "optimal_layout",
     "perturbation_study",
+    "perturbed",
     "pose_covariances",
     "station_arrangements",
 ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from tsgt.analysis.design import Perturbation, equivalent_noise, perturbation_study
+from tsgt.analysis.design import Perturbation, equivalent_noise, perturbed
 from tsgt.analysis.diagnosis import diagnose_smoothed
 from tsgt.analysis.evaluation import (
     compare,
@@ -301,9 +301,12 @@ def _pose_noise(recording: Recording, distances: InterPrismDistances | None) -> 
     measured = equivalent_noise(
         layout, mean_m, samples=_EQUIVALENT_SAMPLES, point_m=centroid_m, random=random
     )
-    noises_m = [level * measured.noise_m for level in _NOISE_LEVELS]
+    unit_noise = random.standard_normal(
+        (_SAMPLES, *layout.shape)
+    )  # the same for all levels: the curves are smooth
+    levels_m = [level * measured.noise_m for level in _NOISE_LEVELS]
     return PoseNoise(
-        perturbation_study(layout, noises_m, samples=_SAMPLES, point_m=centroid_m, random=random), measured
+        [perturbed(layout, noise_m, unit_noise, point_m=centroid_m) for noise_m in levels_m], measured
     )
 
 

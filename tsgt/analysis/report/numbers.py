@@ -10,6 +10,7 @@ import numpy as np
 
 from tsgt.analysis.evaluation import noise_scales_by_axis
 from tsgt.analysis.report.calibration import calibration_numbers
+from tsgt.analysis.report.diagnosis_section import diagnosis_numbers
 from tsgt.analysis.report.findings import position_sigma_mm, rotation_sigma_deg
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import nan_median
@@ -58,7 +59,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
     if f.distance_errors is not None:
         found["errors_by_motion_mm"] = _by_motion(f.distance_errors)
     if f.diagnosis is not None:
-        found["diagnosis"] = f.diagnosis.numbers()
+        found |= diagnosis_numbers(f.diagnosis)
     if f.held_out is not None:
         found["held_out_mm"] = {
             name: {**dataclasses.asdict(each.statistics), "gaps": dataclasses.asdict(each.gaps)}

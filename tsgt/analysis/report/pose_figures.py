@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.figures import curve, dots, note, stroke
+from tsgt.analysis.figures import curve, dots, stroke
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -61,8 +61,13 @@ def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray
 
 def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -> None:
     """Draw the cumulative distribution of the held-out prediction errors of each estimator."""
-    axes = figure.subplots(1, 2, sharey=True)
-    for panel, gap, title in zip(axes, (False, True), ("gaps up to 1 s", "gaps over 1 s"), strict=True):
+    parts = [
+        (gap, title)
+        for gap, title in ((False, "gaps up to 1 s"), (True, "gaps over 1 s"))
+        if any((each.at_gap == gap).any() for each in held_out.values())
+    ]
+    axes = figure.subplots(1, max(1, len(parts)), sharey=True, squeeze=False)[0]
+    for panel, (gap, title) in zip(axes, parts, strict=False):
         reach_mm = 0.0
         for row, (name, each) in enumerate(held_out.items()):
             chosen = np.sort(1e3 * each.error_m[each.at_gap == gap])
@@ -71,11 +76,7 @@ def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -
             panel.plot(chosen, share, color=look.color, linestyle=look.linestyle, label=name)
             # The largest errors would compress all others.
             reach_mm = max(reach_mm, 1.2 * np.percentile(chosen, 97) if len(chosen) else 0.0)
-        if reach_mm:
-            panel.set_xlim(0.0, reach_mm)
-        else:
-            note(panel, "none")
-            panel.set_xticks([])
+        panel.set_xlim(0.0, reach_mm or 1.0)
         panel.set_title(title, loc="left")
         panel.set_xlabel("prediction error (mm)")
     axes[0].set_ylabel("share with a smaller error (%)")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.evaluation import noise_scales_by_axis
 from tsgt.analysis.figures import panels_height_mm
 from tsgt.analysis.report import pose_figures as draw
 from tsgt.analysis.report.numbers import difference_numbers, perturbation_numbers, pose_numbers
@@ -128,9 +129,14 @@ def residual_section(f: Findings, axis: TimeAxis) -> Section:
         return Section(title, ("Unknown without the continuous trajectory.",))
     motion = f.continuous.motion
     text = (
-        f"The noise of the measurements is {motion.noise_scale:.2f} times the stated noise of the instruments"
-        + ("." if motion.tuned else ", as recorded: there are too few measurements to estimate it."),
+        f"The trajectory was fitted with {motion.noise_scale:.2f} times the stated noise of the instruments"
+        + (
+            "; by station and component in the table. Errors of the set-up count as noise here."
+            if motion.tuned
+            else ", as recorded: there are too few measurements to estimate it."
+        ),
     )
+    factors = noise_scales_by_axis(f.continuous.fit, f.continuous.sources)
     rows = [
         (
             f"{station} {_COMPONENTS.get(component, component.replace('_', ' '))}",
@@ -138,6 +144,7 @@ def residual_section(f: Findings, axis: TimeAxis) -> Section:
             format_number(e.mean, 2),
             format_number(e.std, 2),
             format_share(e.beyond_3_sigma, 2),
+            format_number(factors[station][component], 2),
         )
         for station, components in f.residuals.items()
         for component, e in components.items()
@@ -146,7 +153,7 @@ def residual_section(f: Findings, axis: TimeAxis) -> Section:
         Table(
             "Difference between measurement and trajectory, divided by its expected standard deviation (expected: mean 0, "
             "standard deviation 1, 0.27 % beyond 3)",
-            ("station", "measurements", "mean", "standard deviation", "beyond 3"),
+            ("station", "measurements", "mean", "standard deviation", "beyond 3", "noise / stated noise"),
             tuple(rows),
         )
     ]

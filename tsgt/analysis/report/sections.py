@@ -10,6 +10,7 @@ import numpy as np
 from tsgt.analysis.figures import TimeAxis, panels_height_mm
 from tsgt.analysis.report import station_figures as draw
 from tsgt.analysis.report.calibration import calibration_section
+from tsgt.analysis.report.diagnosis_section import diagnosis_section
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import (
     MAX_LISTED,
@@ -37,8 +38,9 @@ def sections(f: Findings) -> list[Section]:
     """Return all sections in their order: those that help most to decide come first."""
     axis = TimeAxis.over(f.start_ns, f.end_ns)
     found = (
-        pose_section(f, axis),
+        diagnosis_section(f.diagnosis, f.problems.get("diagnosis")),
         reference_section(f, axis),
+        pose_section(f, axis),
         estimator_section(f, axis),
         _distances(f, axis),
         residual_section(f, axis),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry import interpolate
+from tsgt.geometry.trajectory import Series, find_rest_in_series
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,11 +26,7 @@ if TYPE_CHECKING:
 
 EPOCH_NS = 50_000_000
 
-# The noise of a stationary prism, a few millimetres, stays well below this speed over 0.3 s and more; a robot slower
-# than this moves less between the measurements of two stations than their noise.
-MAX_STATIONARY_SPEED_MPS = 0.05
-SPEED_BASELINE_NS = 300_000_000
-MIN_STATIONARY_NS = 3_000_000_000
+MIN_SIGMA_M = 5e-4  # A recording may state no noise; tests of rest compare with it
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +154,7 @@ def inter_prism(
     chosen = [tracks[prism.prism] for prism in parameters.prisms]
     found = distances_at_epochs(parameters, tracks) if found is None else found
     if stationary_ns is None:
-        stationary = stationary_intervals(chosen, parameters.pipeline.outage_limit_ns)
+        stationary = stationary_intervals(chosen)
     else:
         start, end = min(int(t.times_ns[0]) for t in chosen), max(int(t.times_ns[-1]) for t in chosen)
         stationary = [(max(a, start), min(b, end)) for a, b in stationary_ns if max(a, start) < min(b, end)]
@@ -176,30 +173,31 @@ def inter_prism(
     )
 
 
-def stationary_intervals(tracks: Sequence[Track], outage_limit_ns: int) -> list[tuple[int, int]]:
-    """Return start and end (Unix ns) of the intervals of 3 s or more in which no prism moves, in the order of time.
+def stationary_intervals(tracks: Sequence[Track]) -> list[tuple[int, int]]:
+    """Return start and end (Unix ns) of the intervals in which no prism moves, in the order of time.
 
-    A track moves between a position and the first one at least 0.3 s later if the speed exceeds 0.05 m/s; across an outage
-    (positions further apart in time than the limit) its motion is unknown and counts as moving. No track may be empty.
+    The tests of rest of the estimator ``continuous``, see docs/explanation/continuous-trajectory.md: prisms that are not
+    measured do not matter, as long as another one is. No track may be empty.
     """
-    moving: list[tuple[int, int]] = []
-    for track in tracks:
-        times = track.times_ns
-        later = np.searchsorted(times, times + SPEED_BASELINE_NS)
-        first = np.flatnonzero(later < len(times))
-        second = later[first]
-        step_ns = times[second] - times[first]
-        step_m = np.linalg.norm(track.points_m[second] - track.points_m[first], axis=-1)
-        moves = (step_m > MAX_STATIONARY_SPEED_MPS * step_ns * 1e-9) | (step_ns > outage_limit_ns)
-        moving += zip(times[first][moves].tolist(), times[second][moves].tolist(), strict=True)
-    start, end = _common_span(tracks)
-    stationary = []
-    previous_end = start
-    for motion_start, motion_end in [*sorted(moving), (end, end)]:
-        if min(motion_start, end) - previous_end >= MIN_STATIONARY_NS:
-            stationary.append((previous_end, min(motion_start, end)))
-        previous_end = max(previous_end, motion_end)
-    return stationary
+    number = 1 + max(int(track.stations.max()) for track in tracks)
+    times_ns = np.concatenate([track.times_ns for track in tracks])
+    order = np.argsort(times_ns, kind="stable")
+    origin_ns = int(times_ns[order[0]])
+    variances_m2 = np.concatenate([np.diagonal(track.covariances_m2, axis1=1, axis2=2) for track in tracks])
+    sigmas_m = np.maximum(np.sqrt(variances_m2), MIN_SIGMA_M)
+    # Another station has other errors of its frame: where it measures the same prism, that does not move.
+    numbers = np.concatenate([row * number + track.stations for row, track in enumerate(tracks)])
+    series = Series(
+        (times_ns[order] - origin_ns) / 1e9,
+        np.unique(numbers[order], return_inverse=True)[1].astype(np.intp),
+        np.concatenate([track.points_m for track in tracks])[order],
+        sigmas_m[order],
+        sigmas_m[order],
+    )
+    return [
+        (origin_ns + round(each.start_s * 1e9), origin_ns + round(each.end_s * 1e9))
+        for each in find_rest_in_series(series)
+    ]
 
 
 def _common_span(tracks: Sequence[Track]) -> tuple[int, int]:

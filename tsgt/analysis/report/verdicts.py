@@ -175,11 +175,11 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         yield Verdict(Level.BAD, "At no time were all prisms measured without a gap.")
         return
     if not static:
-        why = "The robot was never stationary for 3 s"
+        why = "The robot was never stationary for some seconds"
         if f.odometry_stationary_ns:
             why = "According to the odometry, the robot was stationary before or after this recording only"
         elif f.odometry_stationary_ns is not None:
-            why = "According to the odometry, the robot was never stationary for 3 s"
+            why = "According to the odometry, the robot was never stationary for some seconds"
         yield Verdict(
             Level.CARE,
             f"{why}: there are no distances between standing prisms, which need no interpolation.",

@@ -213,7 +213,8 @@ class _Windows:
             TREND_SIGNIFICANCE, np.maximum(trends, 1), safe_freedom
         )
         # Von Neumann's ratio: successive differences against the scatter about the mean.
-        ratio = total(steps) / np.maximum(about_mean.sum(axis=(1, 2)), 1e-9)
+        least = MIN_SCATTER * freedom  # Less is taken for chance, and nothing is left to be correlated
+        ratio = np.maximum(total(steps), least) / np.maximum(about_mean.sum(axis=(1, 2)), least + 1e-9)
         white = ratio > 1.0 - MIN_WHITENESS_SIGMAS / np.sqrt(np.maximum(freedom, 1.0))
         vibration_m2 = (scatter - 1.0) / np.maximum(total(precision) / np.maximum(total(number), 1.0), 1e-9)
         return conclusive, conclusive & no_trend & white & (vibration_m2 < MAX_VIBRATION_M**2)

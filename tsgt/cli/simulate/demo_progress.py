@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from array import array
@@ -161,17 +162,18 @@ class Progress:
         elapsed_s = (status.stamp_ns - self._start_ns) / 1e9
         newest = self._valid[self.kind].newest
         text = f"{elapsed_s:5.0f} s"
+        at = point_label(self._demo.parameters.reference_point)
         if newest is not None:
             position = " ".join(f"{value:6.2f}" for value in newest.position_m or ())
-            text += f"  {point_label(self._demo.parameters.reference_point)} at {position} m"
+            text += f"  {at} at {position} m"
         lines = [text]
         for kind in sorted(self.poses):
             keys = self.live_poses(kind).keys()
-            lines.append(
-                f"         {kind:<12} {keys['valid_poses']}/{keys['poses']} poses valid  "
-                f"{'newest measurement' if kind == 'predicted' else 'sent'} {keys['age_ms']['p50']:.0f} ms old  "
-                f"error {keys['position_rms_mm']:.1f} mm {keys['orientation_rms_deg']:.2f} deg rms"
-            )
+            line = f"         {kind:<12} {keys['valid_poses']}/{keys['poses']} poses valid  "
+            line += f"{'newest measurement' if kind == 'predicted' else 'sent'} {keys['age_ms']['p50']:.0f} ms old"
+            if math.isfinite(keys["position_rms_mm"]):
+                line += f"  rms error {keys['position_rms_mm']:.1f} mm at {at}, {keys['orientation_rms_deg']:.2f} deg"
+            lines.append(line)
         for station in status.stations:
             label, _ = station_label(station)
             rate = "" if station.rate_hz is None else f"  {station.rate_hz:.2f} Hz"

@@ -37,6 +37,7 @@ from tsgt.analysis.evaluation.inter_prism import (
     distances_at_epochs,
     inter_prism,
 )
+from tsgt.analysis.evaluation.live_comparison import LiveComparison, compare_live
 from tsgt.analysis.evaluation.live_poses import AgeBin, LivePoseErrors, LivePoses, LivePoseStatistics
 from tsgt.analysis.evaluation.metrics import (
     Align,
@@ -74,6 +75,7 @@ __all__ = [
     "Fold",
     "HeldOutErrors",
     "InterPrismDistances",
+    "LiveComparison",
     "LivePoseErrors",
     "LivePoseStatistics",
     "LivePoses",
@@ -92,6 +94,7 @@ __all__ = [
     "absolute_errors",
     "compare",
     "compare_aligned",
+    "compare_live",
     "component_sigmas",
     "cross_validate",
     "distances_at_epochs",

@@ -13,6 +13,7 @@ from tsgt.analysis.diagnosis import diagnose_smoothed
 from tsgt.analysis.evaluation import (
     compare,
     compare_aligned,
+    compare_live,
     distances_at_epochs,
     error_details,
     held_out_errors,
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
         AlignedErrorStatistics,
         HeldOutErrors,
         InterPrismDistances,
+        LiveComparison,
         Outlier,
         PoseErrorDetails,
         PoseErrorStatistics,
@@ -103,6 +105,7 @@ class Findings:
         Against the reference by estimator: unaligned, by component and over distances, after an alignment, and mean poses of
         stationary intervals; positions at the reference point, most also at the prisms' centroid.
     diagnosis : Causes of errors.
+    live : Errors of the poses as streamed; None without any.
     problems : Reasons for missing content, as sentences, by its name.
     """
 
@@ -130,6 +133,7 @@ class Findings:
     reference: Reference | None = None
     pose_noise: PoseNoise | None = None
     diagnosis: Diagnosis | None = None
+    live: LiveComparison | None = None
     problems: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -256,6 +260,16 @@ def collect_findings(
         normalised=np.empty((0, 3)) if continuous is None else normalised_residuals(continuous.fit),
         reference_errors=errors,
         error_details=details,
+        live=None
+        if not poses_of
+        # Lines that cannot be read were an error, or skipped, when the recording was loaded.
+        else compare_live(
+            recording,
+            path,
+            poses_of.get("continuous", next(iter(poses_of.values()))),
+            reference,
+            keep_going=True,
+        ),
         aligned_errors=aligned,
         stationary_errors=stationary,
         reference=reference,

@@ -60,6 +60,8 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
         found["errors_by_motion_mm"] = _by_motion(f.distance_errors)
     if f.diagnosis is not None:
         found |= diagnosis_numbers(f.diagnosis)
+    if f.live is not None:
+        found["live"] = f.live.keys()
     if f.held_out is not None:
         found["held_out_mm"] = {
             name: {**dataclasses.asdict(each.statistics), "gaps": dataclasses.asdict(each.gaps)}

@@ -11,6 +11,7 @@ from tsgt.analysis.figures import TimeAxis, panels_height_mm
 from tsgt.analysis.report import station_figures as draw
 from tsgt.analysis.report.calibration import calibration_section
 from tsgt.analysis.report.diagnosis_section import diagnosis_section
+from tsgt.analysis.report.live_section import live_section
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import (
     MAX_LISTED,
@@ -41,6 +42,7 @@ def sections(f: Findings) -> list[Section]:
         diagnosis_section(f.diagnosis, f.problems.get("diagnosis")),
         reference_section(f, axis),
         pose_section(f, axis),
+        live_section(f.live, f.point),
         estimator_section(f, axis),
         _distances(f, axis),
         residual_section(f, axis),

@@ -9,10 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from tsgt.analysis.diagnosis import diagnose_smoothed
-from tsgt.analysis.evaluation import held_out_errors, inter_prism, outliers, residual_statistics
+from tsgt.analysis.evaluation import (
+    compare_live,
+    held_out_errors,
+    inter_prism,
+    outliers,
+    residual_statistics,
+)
 from tsgt.analysis.processing import process
 from tsgt.analysis.smoothing import smooth_recording
-from tsgt.cli.desk.live_poses import compare_live, print_live
+from tsgt.cli.desk.live_poses import print_live
 from tsgt.cli.desk.reference import compare_estimators, print_comparisons
 from tsgt.cli.desk.report import assess, print_verdicts, report_evaluation
 from tsgt.cli.options import (

@@ -8,8 +8,11 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.records import EVENT, NO_POSE, POSE, START, measurement, recording_bytes
+from harness.records import EVENT, HEADER, NO_POSE, PARAMETERS, POSE, START, measurement, recording_bytes
 from rosbags.highlevel import AnyReader
+
+from tsgt.model import ReferencePoint
+from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -175,3 +178,50 @@ def test_time_beyond_ros_2_is_one_line(tsgt: Tsgt, live: Path, tmp_path: Path) -
     assert outcome.code == 1
     assert "January 2038" in outcome.err
     assert not output.exists()
+
+
+LIDAR = ReferencePoint(name="lidar", position_m=(0.0, 0.0, 2.0), orientation_xyzw=(1.0, 0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def two_points(tmp_path: Path) -> Path:
+    """Two sessions of a master that was restarted with another reference point, at rest."""
+    path = tmp_path / "two.jsonl"
+    first = dataclasses.replace(POSE, orientation_xyzw=(0.0, 0.0, 0.0, 1.0))
+    later = dataclasses.replace(
+        first,
+        stamp_ns=first.stamp_ns + PERIOD_NS,
+        child_frame="lidar",
+        position_m=(1.0, 2.0, 1.9),
+        orientation_xyzw=(1.0, 0.0, 0.0, 0.0),
+    )
+    parameters = dataclasses.replace(PARAMETERS, reference_point=LIDAR)
+    path.write_bytes(
+        recording_bytes(first) + b"".join(encode_line(r) + b"\n" for r in (HEADER, parameters, later))
+    )
+    return path
+
+
+def test_all_poses_of_a_file_are_of_one_point(tsgt: Tsgt, two_points: Path) -> None:
+    """Of the first session's, or of the one that is given; the comment and each row name it."""
+    for options, name, z_m in (((), "robot", -0.1), (("--point", "lidar=0,0,2,1,0,0,0"), "lidar", 1.9)):
+        tum = tsgt("export", two_points, "--format", "tum", *options).out.splitlines()
+        assert tum[0].startswith(f"# {name} in station1")
+        assert [float(line.split()[3]) for line in tum[2:]] == pytest.approx([z_m, z_m])
+        rows = list(csv.DictReader(tsgt("export", two_points, "--format", "csv", *options).out.splitlines()))
+        assert [row["child_frame"] for row in rows] == [name, name]
+        assert [float(row["z_m"]) for row in rows] == pytest.approx([z_m, z_m])
+
+
+def test_frames_of_an_mcap_file_hang_on_the_point(tsgt: Tsgt, two_points: Path, tmp_path: Path) -> None:
+    """The moving transform is that of the point; the robot frame, with its prisms, is fixed to it."""
+    output = tmp_path / "out.mcap"
+    assert tsgt("export", two_points, "--point", "lidar=0,0,2,1,0,0,0", "--output", output).code == 0
+    found = read(output)
+    assert {t.child_frame_id for m in found["/tf"] for t in m.transforms} == {"lidar"}
+    assert {m.child_frame_id for m in found["/tsgt/odometry"]} == {"lidar"}
+    robot = next(t for m in found["/tf_static"] for t in m.transforms if t.child_frame_id == "robot")
+    assert robot.header.frame_id == "lidar"
+    # Half a turn about x: what is up for the robot is down for the sensor.
+    assert robot.transform.translation.z == pytest.approx(2.0)
+    assert abs(robot.transform.rotation.x) == pytest.approx(1.0)

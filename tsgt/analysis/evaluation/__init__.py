@@ -47,6 +47,11 @@ from tsgt.analysis.evaluation.metrics import (
     interior_mask,
     pose_errors,
 )
+from tsgt.analysis.evaluation.normalised_prediction import (
+    NormalisedErrorStatistics,
+    normalised_by_axis,
+    normalised_prediction_errors,
+)
 from tsgt.analysis.evaluation.reference import (
     Reference,
     StationaryStatistics,
@@ -79,6 +84,7 @@ __all__ = [
     "LivePoseErrors",
     "LivePoseStatistics",
     "LivePoses",
+    "NormalisedErrorStatistics",
     "Outlier",
     "PairDistances",
     "PoseComponents",
@@ -107,6 +113,8 @@ __all__ = [
     "interpolation_errors",
     "newest_age_s",
     "noise_scales_by_axis",
+    "normalised_by_axis",
+    "normalised_prediction_errors",
     "normalised_residuals",
     "outliers",
     "pose_components",

@@ -8,13 +8,14 @@ folds; each fold of one prism is held out once. docs/reference/evaluate.md defin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.evaluation.normalised_prediction import normalised_prediction_errors
 from tsgt.analysis.smoothing import estimate_motion_model
-from tsgt.geometry.trajectory import fit_trajectory
+from tsgt.geometry.trajectory import fit_trajectory, scale_noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -74,10 +75,16 @@ class PredictionErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutErrors:
-    """Distance between measured and predicted position of N held-out measurements, by fold; ``at_gap`` as in :class:`Fold`."""
+    """Distance between measured and predicted position of N held-out measurements, by fold; ``at_gap`` as in :class:`Fold`.
+
+    ``normalised``: (N, 3) by measured component, see :func:`normalised_prediction_errors`, and ``rows`` their rows of the
+    observations; None without covariance.
+    """
 
     error_m: FloatArray
     at_gap: NDArray[np.bool_]
+    normalised: FloatArray | None = None
+    rows: NDArray[np.intp] | None = None
 
     @property
     def statistics(self) -> PredictionErrorStatistics:
@@ -169,6 +176,7 @@ def held_out_errors(
             estimate_motion_model(observations.select(training_rows(observations, number)), pipeline)
         )
     done = 0
+    normalised = []
 
     def smoothing_errors(fold: Fold) -> FloatArray:
         nonlocal done
@@ -181,11 +189,18 @@ def held_out_errors(
             occluded_prior=pipeline.motion,
             noise_scale=motion.noise_scales,
         )
-        return trajectory_errors(found.trajectory, observations.select(fold.test))
+        test = observations.select(fold.test)
+        normalised.append(
+            normalised_prediction_errors(found.trajectory, scale_noise(test, motion.noise_scales))
+        )
+        return trajectory_errors(found.trajectory, test)
 
     result: dict[Estimator, HeldOutErrors] = {
         "linear": cross_validate(splits, lambda fold: interpolation_errors(observations, fold)),
         "continuous": cross_validate(splits, smoothing_errors),
     }
+    if splits:
+        rows = np.concatenate([fold.test for fold in splits])
+        result["continuous"] = replace(result["continuous"], normalised=np.concatenate(normalised), rows=rows)
     report(1.0)
     return result

@@ -7,13 +7,14 @@ straight driving makes the next bend impossible. See docs/explanation/continuous
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from tsgt.errors import GeometryError
+from tsgt.geometry.trajectory.adaptive_noise import ADAPTATIONS, adapted_sigmas
 from tsgt.geometry.trajectory.gauss_newton import (
     REJECTION_THRESHOLD,
     knot_times,
@@ -63,6 +64,8 @@ _SCALE_PARAMETER = (
 _LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03, 0.5])
 _UPPER = np.log([30.0, 30.0, 10.0, 30.0, 30.0, 10.0, 20.0])
 _MAX_DEVIATION = np.log(10.0)
+_ADAPTED_ITERATIONS = 2  # The next adaptation need not wait for convergence
+_TIME_SCALE_LIMITS = np.log([0.05, 1.0])
 _MEDIAN_SQUARED_DISTANCE = 2.37  # Of the chi-square distribution with 3 degrees of freedom
 _TOLERANCE = 1e-5
 _MAX_STEPS = 40
@@ -89,12 +92,41 @@ class _Segment:
         self.rest = find_rest(observations)
         self.knots: States = initial_guess(self.observations, knot_times(self.observations.time_s))
         self.moving = ~steps_in_rest(self.rest, self.knots.time_s)
+        self.local = np.ones((len(self.moving), 6))  # Factors on the variance of the accelerations
         self.log_evidence = -np.inf
 
     def factors(self, prior: MotionPrior) -> tuple[FloatArray, FloatArray | None]:
         """Acceleration sigmas of each step, (K - 1, 6), and what :func:`rest_factors` gives at rest."""
-        moving = np.repeat(axis_sigmas(prior)[None], len(self.moving), axis=0)
+        moving = axis_sigmas(prior) * np.sqrt(self.local)
         return rest_factors(self.rest, self.knots.time_s, moving, self.observations.layout)
+
+    def adapt(self, parameters: FloatArray) -> None:
+        """Let the process noise follow the motion, with given parameters."""
+        prior, _ = _from_log_parameters(parameters)
+        observations = _with_noise(self.observations, parameters)
+        self.local = np.ones_like(self.local)
+        initial, rest = self.factors(prior)
+        sigmas = initial
+        for _ in range(ADAPTATIONS):
+            solution = solve(
+                observations,
+                self.knots,
+                prior,
+                sigmas=sigmas,
+                rest=rest,
+                max_iterations=_ADAPTED_ITERATIONS,
+                reject_outliers=False,
+            )
+            self.knots = solution.knots
+            sigmas = adapted_sigmas(
+                solution,
+                *solution.factor.marginals(),
+                sigmas=sigmas,
+                initial_sigmas=initial,
+                adaptable=self.moving,
+            )
+        self.local = (sigmas / initial) ** 2
+        self.log_evidence = -np.inf
 
     def record(self, knots: States, log_evidence: float) -> None:
         """Keep a trajectory if it is more probable."""
@@ -125,8 +157,8 @@ def tune(
     scales = np.ones((len(observations.frames), 3)) * (1.0 if noise_scale is None else noise_scale)
     initial = log_parameters(MotionPrior() if start is None else start, scales)
     deviations = np.full(scales.size, _MAX_DEVIATION)
-    lower = np.minimum(np.concatenate([_LOWER, -deviations]), initial)
-    upper = np.maximum(np.concatenate([_UPPER, deviations]), initial)
+    lower = np.minimum(np.concatenate([_LOWER, -deviations, _TIME_SCALE_LIMITS[:1]]), initial)
+    upper = np.maximum(np.concatenate([_UPPER, deviations, _TIME_SCALE_LIMITS[1:]]), initial)
     if noise_scale is not None:
         lower[_SCALE_PARAMETER:] = upper[_SCALE_PARAMETER:] = initial[_SCALE_PARAMETER:]
     if noise_only:
@@ -140,9 +172,13 @@ def maximise_evidence(
     lower: FloatArray,
     upper: FloatArray,
     *,
+    local: bool = True,
     on_progress: Callable[[int], None] | None = None,
 ) -> Hyperparameters:
-    """Maximise the evidence by L-BFGS-B; bounds and start: parameters of :func:`log_parameters`; as :func:`tune`."""
+    """Maximise the evidence by L-BFGS-B; bounds and start: parameters of :func:`log_parameters`; as :func:`tune`.
+
+    With ``local`` the process noise varies along the drive, and the evidence is that with its estimate.
+    """
     segments = _segments(observations)
     evaluations = 0
     # Per measurement: the first step of the search is then of order one, a factor of e in a parameter.
@@ -159,14 +195,21 @@ def maximise_evidence(
             value, gradient = value + part, gradient + part_gradient
         return -per_measurement * value, -per_measurement * gradient
 
-    found = minimize(
-        negative,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=list(zip(lower, upper, strict=True)),
-        options={"maxiter": _MAX_STEPS, "ftol": _TOLERANCE},
-    )
+    def maximise(start: FloatArray) -> OptimizeResult:
+        return minimize(
+            negative,
+            start,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=list(zip(lower, upper, strict=True)),
+            options={"maxiter": _MAX_STEPS, "ftol": _TOLERANCE},
+        )
+
+    found = maximise(start)
+    if local:
+        for segment in segments:
+            segment.adapt(found.x)
+        found = maximise(found.x)
     prior, scales = _from_log_parameters(found.x)
     return Hyperparameters(
         prior, scales, overall_scale(observations, scales), -float(found.fun) / per_measurement
@@ -205,46 +248,54 @@ def _without_blunders(observations: Observations) -> Observations:
 
 
 def log_parameters(prior: MotionPrior, scales: FloatArray) -> FloatArray:
-    """(7 + 3 S,) logarithms of prior and noise scales, (S, 3).
+    """(8 + 3 S,) logarithms of prior and noise scales, (S, 3).
 
-    Acceleration sigmas x and z and correlation time, the same of the rotation, the common factor on the noise, and each
-    factor's deviation from it.
+    Acceleration sigmas x and z and correlation time, the same of the rotation, the common factor on the noise, each factor's
+    deviation from it, and a factor on the time sigmas. These allow for errors that measurements share for minutes, which do
+    not scatter: with all of them as white noise, there would seem to be less noise of the instruments. The factor is for
+    the tuning only.
     """
     sigmas = axis_sigmas(prior)
     x, _, z, roll, _, yaw = sigmas
     times_s = prior.acceleration_correlation_time_s, prior.angular_acceleration_correlation_time_s
     motion = np.log([x, z, times_s[0], roll, yaw, times_s[1]])
     log_scales = np.log(scales).ravel()
-    return np.concatenate([motion, [log_scales.mean()], log_scales - log_scales.mean()])
+    return np.concatenate([motion, [log_scales.mean()], log_scales - log_scales.mean(), [0.0]])
 
 
 def _from_log_parameters(parameters: FloatArray) -> tuple[MotionPrior, FloatArray]:
     values = np.exp(parameters)
-    scales = values[_SCALE_PARAMETER] * values[_SCALE_PARAMETER + 1 :].reshape(-1, 3)
+    scales = values[_SCALE_PARAMETER] * values[_SCALE_PARAMETER + 1 : -1].reshape(-1, 3)
     return prior_from_axes(list(values[_SIGMA_PARAMETERS]), list(values[list(_TIME_PARAMETERS)])), scales
+
+
+def _with_noise(observations: Observations, parameters: FloatArray) -> Observations:
+    _, scales = _from_log_parameters(parameters)
+    time_sigma_s = observations.time_sigma_s * float(np.exp(parameters[-1]))
+    return replace(scale_noise(observations, scales), time_sigma_s=time_sigma_s)
 
 
 def _log_hyperprior(parameters: FloatArray) -> tuple[float, FloatArray]:
     """Log density of the factors' deviations from the common one, and its gradient."""
     gradient = np.zeros_like(parameters)
-    deviations = parameters[_SCALE_PARAMETER + 1 :] / SCALE_SPREAD
-    gradient[_SCALE_PARAMETER + 1 :] = -deviations / SCALE_SPREAD
+    deviations = parameters[_SCALE_PARAMETER + 1 : -1] / SCALE_SPREAD
+    gradient[_SCALE_PARAMETER + 1 : -1] = -deviations / SCALE_SPREAD
     return -0.5 * float(deviations @ deviations), gradient
 
 
 def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatArray]:
     """Log evidence of one segment and its gradient by the log parameters."""
-    prior, scales = _from_log_parameters(parameters)
-    observations = scale_noise(segment.observations, scales)
+    prior, _ = _from_log_parameters(parameters)
+    observations = _with_noise(segment.observations, parameters)
     step_sigmas, rest = segment.factors(prior)
     solution = solve(observations, segment.knots, prior, sigmas=step_sigmas, rest=rest, reject_outliers=False)
     value = log_evidence(solution, observations, prior, step_sigmas)
     segment.record(solution.knots, value)
     covariance, cross_covariance = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
-    by_scale = log_scale_gradient(solution, observations, covariance)
+    by_scale, gradient[-1] = log_scale_gradient(solution, observations, covariance)
     gradient[_SCALE_PARAMETER] = by_scale.sum()
-    gradient[_SCALE_PARAMETER + 1 :] = by_scale.ravel()
+    gradient[_SCALE_PARAMETER + 1 : -1] = by_scale.ravel()
     moments = expected_moments(solution, covariance, cross_covariance)
     sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
     energies = expected_squared_distances(moments, solution.process.phi, solution.process.information)

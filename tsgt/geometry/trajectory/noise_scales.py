@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory.gauss_newton import Solution
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
-SCALE_SPREAD = 0.7
-"""One sigma of a factor's logarithm about that common to all. Wide: a factor of two. It matters only for a station or
-component with next to no redundancy, whose factor the evidence would otherwise drive to zero or infinity.
+SCALE_SPREAD = 0.4
+"""One sigma of a factor's logarithm about that common to all. Wide: a factor of 1.5. It matters only for a station or
+component with little redundancy, whose factor the evidence would otherwise drive to zero or infinity.
 """
 
 
@@ -36,11 +36,13 @@ def overall_scale(observations: Observations, scales: FloatArray) -> float:
     return float(np.sqrt(np.mean(scales[observations.station] ** 2)))
 
 
-def log_scale_gradient(solution: Solution, observations: Observations, covariance: FloatArray) -> FloatArray:
-    """Differentiate the log evidence by the logarithms of the factors, (S, 3), by Fisher's identity.
+def log_scale_gradient(
+    solution: Solution, observations: Observations, covariance: FloatArray
+) -> tuple[FloatArray, float]:
+    """Differentiate the log evidence by the logarithms of the factors, (S, 3), and of one on all time sigmas.
 
-    Expected outer products of the residuals, compared with the covariance that the noise states; the part of it that is due
-    to time errors does not scale. ``covariance``: of the knots, (K, 18, 18).
+    By Fisher's identity: expected outer products of the residuals, compared with the covariance that the noise states.
+    ``covariance``: of the knots, (K, 18, 18).
     """
     linearised = solution.linearised
     information = np.linalg.inv(linearised.covariance(observations))
@@ -55,4 +57,12 @@ def log_scale_gradient(solution: Solution, observations: Observations, covarianc
     )
     gradient = np.zeros((len(observations.frames), 3))
     np.add.at(gradient, observations.station, by_row)
-    return gradient
+    by_time = (linearised.by_point @ linearised.velocity_mps[:, :, None]) * observations.time_sigma_s[
+        :, None, None
+    ]
+    projected = np.swapaxes(by_time, 1, 2) @ weighted
+    expected_time = (np.swapaxes(by_time, 1, 2) @ normalised[:, :, None])[:, 0, 0] ** 2 + np.einsum(
+        "mj,mjk,mk->m", projected[:, 0], covariance[solution.knot_index], projected[:, 0], optimize=True
+    )
+    stated = (np.swapaxes(by_time, 1, 2) @ information @ by_time)[:, 0, 0]
+    return gradient, float((solution.weights * expected_time - stated).sum())

@@ -1,0 +1,41 @@
+"""Prediction errors in sigmas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from harness.prior_motion import draw_motions, measure, sorted_by_time
+
+from tsgt.analysis.evaluation import NormalisedErrorStatistics, normalised_prediction_errors
+from tsgt.geometry.trajectory import fit_trajectory, scale_noise
+from tsgt.model import MotionPrior
+
+PRIOR = MotionPrior()
+
+
+def test_errors_of_a_right_model_have_unit_variance() -> None:
+    """A robot that moves as the prior says, measured with the stated noise; twice the stated noise halves the errors."""
+    squares, halved = [], []
+    for seed, motion in enumerate(draw_motions(PRIOR, count=4, duration_s=21.0, seed=3)):
+        measured = sorted_by_time(measure(motion, until_s=20.0, seed=seed))
+        rows = np.arange(len(measured))
+        test = (rows % 7 == 3) & (rows > 20) & (rows < len(rows) - 20)
+        found = fit_trajectory(measured.select(~test), prior=PRIOR, noise_scale=1.0)
+        held_out = measured.select(test)
+        squares.append(normalised_prediction_errors(found.trajectory, held_out) ** 2)
+        halved.append(normalised_prediction_errors(found.trajectory, scale_noise(held_out, 100.0)) ** 2)
+    assert np.mean(np.concatenate(squares)) == pytest.approx(1.0, abs=0.25)
+    assert np.mean(np.concatenate(halved)) < 0.01
+
+
+def test_statistics_of_normal_errors_and_of_one_outlier() -> None:
+    """One outlier in a hundred raises the rms, and hardly the robust figure."""
+    errors = np.random.default_rng(1).normal(size=2000)
+    good = NormalisedErrorStatistics.of(errors)
+    assert [good.rms, good.robust] == pytest.approx([1.0, 1.0], abs=0.05)
+    assert good.beyond < 0.004
+    errors[::100] = 20.0
+    bad = NormalisedErrorStatistics.of(errors)
+    assert bad.rms > 2.0
+    assert bad.robust == pytest.approx(good.robust, abs=0.05)
+    assert bad.beyond == pytest.approx(0.01, abs=0.004)

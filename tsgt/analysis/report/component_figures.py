@@ -33,6 +33,7 @@ def draw_components(figure: Figure, poses: PoseComponents, axis: TimeAxis) -> No
         left, right = axes[row]
         _band(left, time, value, 2 * (sigma if row < 3 else np.degrees(sigma)))
         curve(left, time, value, 0, label="pose", dashes=False)
+        left.ticklabel_format(axis="y", useOffset=False)
         left.set_ylabel(f"{name} ({'m' if row < 3 else 'deg'})")
         for number, (part, label) in enumerate(
             ((sigma, "whole standard deviation"), (poses.sigma_common[:, row], "part common to all poses"))

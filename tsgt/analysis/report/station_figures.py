@@ -152,7 +152,7 @@ def draw_histograms(figure: Figure, found: InterPrismDistances) -> None:
     ]
     reach_mm = 1.1 * 1e3 * max([*spread, 1e-3])
     for column, (static, dynamic) in enumerate(zip(found.static, found.dynamic, strict=True)):
-        for row, (pair, name) in enumerate(((static, "stationary"), (dynamic, "all epochs"))):
+        for row, (pair, name) in enumerate(((static, "standing still"), (dynamic, "all the time"))):
             _histogram(axes[row, column], pair, reach_mm, row)
             if column == 0:
                 axes[row, column].set_ylabel(f"{name}\nshare (%)")

@@ -45,14 +45,15 @@ def test_rejected_target_is_named(tmp_path: Path) -> None:
     lines[8] = " , ".join([*cells[:5], str(float(cells[5]) + 0.05), *cells[6:]])
     path.write_text("\n".join(lines), encoding="utf-8")
     solved = stations_from_targets(path, target_constant_m=TARGET_CONSTANT_M, prism_constant_m=0.0)
-    assert solved.notes == (f"{path}: target 3 of station 2 rejected",)
+    (note,) = solved.notes
+    assert note.startswith(f"{path}: station 2: target 3 rejected: 50.0 mm from the place")
     np.testing.assert_allclose([s.T_station1_station for s in solved.stations], FRAMES, atol=1e-9)
 
 
 def test_inconsistent_targets_are_rejected(tmp_path: Path) -> None:
     """A wrong target constant distorts every distance."""
     path = write_targets(tmp_path)
-    with pytest.raises(InputFileError, match="targets of station 2 are inconsistent"):
+    with pytest.raises(InputFileError, match="the targets are inconsistent"):
         stations_from_targets(path, target_constant_m=0.5, prism_constant_m=0.0)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.calibration import DATA_SHEET_SIGMA, ERRORS, CauseKind, InstrumentError
+from tsgt.geometry.calibration import DATA_SHEET_SIGMA, CauseKind, InstrumentError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.calibration import Cause, FitQuality
 
 NOISE_LEVEL = 1e-3  # Probability by chance of a misfit that is called noise larger than stated
-SPEC_FACTOR = 3.0  # Data sheet's sigmas beyond which an estimated instrument error is reported as one
+SPEC_FACTOR = 3.0  # Data sheet's sigmas that an instrument error surely exceeds if it is reported as one
 DOMINANT = 0.95  # Share of a displacement's length in one direction that makes it an error of one reading
 CONFUSED_M = 0.02  # Distance from another target's place below which the numbers were confused
 UNEVEN = 1.3  # Ratio of noise scales beyond which the largest is named
@@ -60,7 +60,9 @@ def target_notes(calibration: TargetCalibration) -> list[str]:
         for cause in network.suspects
         if cause.kind is CauseKind.SIGHT
     ]
-    if network.overall.p_value < NOISE_LEVEL:
+    # The misfit of a tripod that moved stays in the residuals.
+    has_moved = any(cause.kind is CauseKind.TRIPOD for cause in network.causes)
+    if network.overall.p_value < NOISE_LEVEL and not has_moved:
         notes.append(_noise_text(calibration, has_suspects=bool(suspects)))
     return notes + suspects
 
@@ -219,8 +221,8 @@ def _before(calibration: TargetCalibration, cause: Cause) -> list[int]:
 
 def _is_beyond_data_sheet(calibration: TargetCalibration, cause: Cause) -> bool:
     assert cause.error is not None  # noqa: S101 (of an instrument)
-    value = calibration.network.network.errors[cause.station, ERRORS.index(cause.error)]
-    return bool(abs(value) > SPEC_FACTOR * DATA_SHEET_SIGMA[cause.error])
+    estimate = calibration.network.errors[cause.station, cause.error]
+    return abs(estimate.value) - 1.5 * estimate.sigma > SPEC_FACTOR * DATA_SHEET_SIGMA[cause.error]
 
 
 def _name(calibration: TargetCalibration, cause: Cause) -> str:

@@ -40,7 +40,9 @@ class CauseSearch:
     residuals : (m,) whitened, after least squares.
     redundancy : Degrees of freedom of the residuals.
     blocks : Columns of each cause, at most four.
-    penalties : By how much each cause must lower twice the negative log-likelihood.
+    priors : (c,) information of a prior about zero on each column; zero where there is none.
+    penalties : By how much each cause must lower twice the negative log-likelihood to be chosen at all.
+    odds : Twice the negative logarithm of how probable each cause is; also counts between causes that explain the same.
     allowed : Whether a subset may be chosen at all.
     """
 
@@ -52,7 +54,9 @@ class CauseSearch:
         *,
         redundancy: int,
         blocks: Sequence[Sequence[int]],
+        priors: FloatArray,
         penalties: FloatArray,
+        odds: FloatArray,
         allowed: Callable[[Subset], bool],
     ) -> None:
         norms = np.sqrt(np.maximum(np.sum(columns**2, axis=0), 1e-300))
@@ -70,12 +74,14 @@ class CauseSearch:
         if places:
             to, of = np.array(places).T
             self._matrix[np.ix_(to, to)] = products[np.ix_(of, of)] + MIN_REDUNDANCY * np.eye(len(to))
+            self._matrix[to, to] += priors[of] / norms[of] ** 2
             self._vector[to] = gains[of]
             self._norms[to] = norms[of]
         self._chi_squared = float(residuals @ residuals)
         self._redundancy = max(redundancy, 1)
         self._count = len(blocks)
         self._penalties = penalties
+        self._odds = odds
         self._allowed = allowed
 
     def costs(self, subsets: Sequence[Subset]) -> FloatArray:
@@ -86,7 +92,7 @@ class CauseSearch:
         n = self._redundancy
         rest = np.maximum(self._chi_squared - drop, 1e-9)
         rescaled = n * (1.0 + np.log(np.maximum(rest / n, 1.0))) + NOISE_SCALE_PENALTY
-        cost: FloatArray = np.minimum(rest, rescaled) + self._penalties[index].sum(axis=1)
+        cost: FloatArray = np.minimum(rest, rescaled) + (self._penalties + self._odds)[index].sum(axis=1)
         return cost
 
     def estimates(self, chosen: Subset) -> dict[int, FloatArray]:
@@ -112,7 +118,7 @@ class CauseSearch:
             chosen, cost = improved
 
     def alternatives(self, chosen: Subset) -> dict[int, tuple[int, ...]]:
-        """Return by chosen cause the others that explain the same nearly as well, whatever their penalty."""
+        """Return by chosen cause the others that explain the same nearly as well, whatever their penalties."""
         base = float(self.costs([chosen])[0]) - self._penalties[list(chosen)].sum()
         others = [cause for cause in range(self._count) if cause not in chosen]
         result: dict[int, tuple[int, ...]] = {}

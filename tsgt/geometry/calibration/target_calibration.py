@@ -253,13 +253,16 @@ def _freed(causes: Sequence[Cause]) -> dict[Column, float]:
             continue
         others = [o for o in cause.alternatives if o.kind is CauseKind.INSTRUMENT and o.error is not None]
         size = abs(float(cause.value[0]))
-        freed[cause.station, 6 + ERRORS.index(cause.error)] = size if others else np.inf
-        for other in others:
-            assert other.error is not None  # noqa: S101 (filtered above)
-            column = (other.station, 6 + ERRORS.index(other.error))
-            freed.setdefault(
-                column, size if other.error is cause.error else 10 * DATA_SHEET_SIGMA[other.error]
-            )
+        for each in (cause, *others):
+            assert each.error is not None  # noqa: S101 (filtered above)
+            column = (each.station, 6 + ERRORS.index(each.error))
+            if each.within_data_sheet:
+                sigma = DATA_SHEET_SIGMA[each.error]
+            elif each is cause and not others:
+                sigma = np.inf
+            else:
+                sigma = size if each.error is cause.error else 10 * DATA_SHEET_SIGMA[each.error]
+            freed[column] = max(freed.get(column, 0.0), sigma)
     return freed
 
 

@@ -15,28 +15,20 @@ import numpy as np
 from scipy.special import chdtri
 
 from tsgt.geometry.calibration.cause_search import CauseSearch
-from tsgt.geometry.calibration.target_network import ERRORS, TARGET_CONSTANT, InstrumentError
+from tsgt.geometry.calibration.target_network import (
+    DATA_SHEET_SIGMA,
+    ERRORS,
+    TARGET_CONSTANT,
+    InstrumentError,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
+    from collections.abc import Collection, Sequence
 
     from numpy.typing import NDArray
 
     from tsgt.geometry.calibration.target_network import Linearisation, TargetReadings
     from tsgt.geometry.rigid import FloatArray
-
-INSTRUMENT_FALSE_ALARM_RATE = 1e-3  # Of any instrument error, in a set that matches its noise model
-SIGHT_FALSE_ALARM_RATE = 1e-4  # Of any sight; the same for a tripod and a tilt
-MAX_SIGHTS = 60  # Candidates; of a larger set those with the largest residuals
-LARGEST_ERROR = {
-    InstrumentError.VERTICAL_INDEX: 2e-3,
-    InstrumentError.COLLIMATION: 2e-3,
-    InstrumentError.RANGE_SCALE: 3e-4,
-    InstrumentError.RANGE_CONSTANT: 0.05,
-}
-"""Beyond, something else is wrong: 2 mrad are 7 arcminutes, 300 ppm an atmosphere of 300 degrees, 50 mm more than any two
-reflectors differ."""
-MIN_TARGETS_PER_ROUND = 3  # Before and after a tripod moved, to tell it from wrong sights
 
 
 class CauseKind(StrEnum):
@@ -49,6 +41,30 @@ class CauseKind(StrEnum):
     TILT = "tilt"  # Of a station that is taken as levelled
 
 
+INSTRUMENT_FALSE_ALARM_RATE = 1e-3  # Of any instrument error, in a set that matches its noise model
+DATA_SHEET_FALSE_ALARM_RATE = 0.05  # The same of errors within the data sheet, which every instrument has
+SIGHT_FALSE_ALARM_RATE = 1e-4  # Of any sight; the same for a tripod and a tilt
+MAX_SIGHTS = 60  # Candidates; of a larger set those with the largest residuals
+ODDS: dict[CauseKind, float] = {
+    CauseKind.INSTRUMENT: 6.0,
+    CauseKind.TARGET_CONSTANT: 6.0,
+    CauseKind.SIGHT: 6.0,
+    CauseKind.TRIPOD: 10.0,
+    CauseKind.TILT: 6.0,
+}
+"""Twice the negative logarithm of the odds: one in 20 for a wrong sight or an instrument outside its data sheet, one in 150 for
+a tripod that moves."""
+LARGEST_ERROR = {
+    InstrumentError.VERTICAL_INDEX: 2e-3,
+    InstrumentError.COLLIMATION: 2e-3,
+    InstrumentError.RANGE_SCALE: 3e-4,
+    InstrumentError.RANGE_CONSTANT: 0.05,
+}
+"""Beyond, something else is wrong: 2 mrad are 7 arcminutes, 300 ppm an atmosphere of 300 degrees, 50 mm more than any two
+reflectors differ."""
+MIN_TARGETS_PER_ROUND = 3  # Before and after a tripod moved, to tell it from wrong sights
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Cause:
     """One possible cause, and its size if it was selected."""
@@ -59,6 +75,8 @@ class Cause:
     error: InstrumentError | None = None
     # Only two stations measured the target: which of them is wrong cannot be seen
     either_station: bool = False
+    # INSTRUMENT: an error of the size that the data sheet allows, with its sigma as prior; False: of any size
+    within_data_sheet: bool = False
     # INSTRUMENT: (1,) its value; TARGET_CONSTANT: (1,) m; SIGHT: (3,) displacement in the first station's frame in m;
     # TRIPOD: (4,) displacement in m and heading in rad; TILT: (2,) rad
     value: FloatArray | None = None
@@ -108,8 +126,12 @@ def select_causes(
             residuals.ravel(),
             redundancy=linear.redundancy,
             blocks=[range(a, b) for a, b in pairwise(ends)],
+            priors=np.concatenate(
+                [np.full(columns.shape[2], _prior_information(cause)) for cause, columns, _ in candidates]
+            ),
             penalties=np.array([penalty for _, _, penalty in candidates]),
-            allowed=lambda subset, causes=causes: _moved_once(causes[row] for row in subset),  # type: ignore[misc]
+            odds=np.array([_odds(cause) for cause in causes]),
+            allowed=lambda subset, causes=causes: _is_possible([causes[row] for row in subset]),  # type: ignore[misc]
         )
         chosen = search.best()
         values = search.estimates(chosen)
@@ -134,6 +156,8 @@ def select_causes(
 
     def is_alternative(row: int, other: int) -> bool:
         exchanged = tuple(other if each == row else each for each in chosen)
+        if not _is_possible([causes[each] for each in exchanged]) or causes[other].label == causes[row].label:
+            return False
         return _is_plausible(causes[other], search.estimates(exchanged)[other], rules)
 
     return tuple(
@@ -151,11 +175,17 @@ _Candidate = tuple[Cause, "FloatArray", float]  # Cause, columns (n, 3, c), pena
 
 def _candidates(readings: TargetReadings, linear: Linearisation, rules: SelectionRules) -> list[_Candidate]:
     stations = range(len(readings.stations))
-    instruments = [
-        (Cause(CauseKind.INSTRUMENT, station, error=error), linear.columns(((station, 6 + row),)))
-        for station in stations
-        for row, error in enumerate(ERRORS)
-    ]
+    usual, instruments = (
+        [
+            (
+                Cause(CauseKind.INSTRUMENT, station, error=error, within_data_sheet=within),
+                linear.columns(((station, 6 + row),)),
+            )
+            for station in stations
+            for row, error in enumerate(ERRORS)
+        ]
+        for within in (True, False)
+    )
     instruments.append((Cause(CauseKind.TARGET_CONSTANT, 0), linear.columns((TARGET_CONSTANT,))))
     sights = _sights(readings, linear)
     tripods = _tripods(readings, linear)
@@ -168,13 +198,19 @@ def _candidates(readings: TargetReadings, linear: Linearisation, rules: Selectio
         else []
     )
     groups = (
+        (usual, DATA_SHEET_FALSE_ALARM_RATE),
         (instruments, INSTRUMENT_FALSE_ALARM_RATE),
         (sights, SIGHT_FALSE_ALARM_RATE),
         (tripods, SIGHT_FALSE_ALARM_RATE),
         (tilts, SIGHT_FALSE_ALARM_RATE),
     )
     return [
-        (cause, columns, float(chdtri(columns.shape[2], rate / len(group))))
+        (
+            cause,
+            columns,
+            float(chdtri(columns.shape[2], rate / len(group)))
+            - (0.0 if group is instruments else _odds(cause)),
+        )
         for group, rate in groups
         for cause, columns in group
     ]
@@ -228,10 +264,23 @@ def _is_plausible(cause: Cause, value: FloatArray, rules: SelectionRules) -> boo
     return cause.error is None or size <= LARGEST_ERROR[cause.error]
 
 
-def _moved_once(causes: Iterable[Cause]) -> bool:
-    """No tripod moved twice."""
-    moved = [cause.station for cause in causes if cause.kind is CauseKind.TRIPOD]
-    return len(set(moved)) == len(moved)
+def _prior_information(cause: Cause) -> float:
+    """Information of the data sheet on an instrument error that it allows."""
+    return DATA_SHEET_SIGMA[cause.error] ** -2.0 if cause.error and cause.within_data_sheet else 0.0
+
+
+def _odds(cause: Cause) -> float:
+    return 0.0 if cause.within_data_sheet else ODDS[cause.kind]
+
+
+def _is_possible(causes: Sequence[Cause]) -> bool:
+    """No instrument error twice, and no tripod that moved twice."""
+    once = [
+        (cause.kind, cause.station, cause.error)
+        for cause in causes
+        if cause.kind in (CauseKind.INSTRUMENT, CauseKind.TRIPOD)
+    ]
+    return len(set(once)) == len(once)
 
 
 def outvoted(readings: TargetReadings, causes: Sequence[Cause]) -> tuple[Cause, ...]:

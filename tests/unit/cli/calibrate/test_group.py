@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from harness.target_field import TargetField
 
 from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_calibration
+from tsgt.geometry.calibration import InstrumentError
 
 if TYPE_CHECKING:
     from harness.cli import Tsgt
@@ -178,6 +180,66 @@ def test_inconsistent_targets_are_not_written(tsgt: Tsgt, tmp_path: Path) -> Non
     assert done.json()["stations"]["2"]["consistent"] is False
     assert "are inconsistent" in done.err
     assert not output.exists()
+
+
+@pytest.mark.parametrize("weights", ["model", "none"])
+def test_excluded_target_is_the_way_on(tsgt: Tsgt, tmp_path: Path, weights: str) -> None:
+    """The printed command leaves the suspect out; exit codes do not depend on the weights."""
+    path, output = documented(0, tmp_path), tmp_path / "frames.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace("20.4692", "20.5192"), encoding="utf-8")
+    arguments = ("calibrate", "targets", path, *TARGET_CONSTANT, "--weights", weights, "--output", output)
+    refused = tsgt(*arguments)
+    assert refused.code == 3
+    assert f"{output} is not written: the targets are inconsistent" in refused.out
+    assert re.search(r"noise scale \d+\.\d+, limit \d\.\d+", refused.err)
+    (left_out,) = re.findall(r"--exclude (\S+) --output", refused.err)
+    assert left_out == "2"
+    done = tsgt(*arguments, "--exclude", left_out, "--json")
+    assert done.json()["written"]["path"] == str(output)
+    assert done.json()["stations"]["2"]["used"] == [1, 3, 4]
+    assert all(check["ok"] for check in done.json()["checks"] if "noise_scale" in check["name"])
+
+
+def test_residual_limit_accepts_the_rest(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The limit is a check of its own, printed with its value."""
+    path = documented(0, tmp_path)
+    path.write_text(path.read_text(encoding="utf-8").replace("20.4692", "20.5192"), encoding="utf-8")
+    done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--max-residual-mm", 10, "--json")
+    (check,) = (c for c in done.json()["checks"] if c["name"] == "station 2 max_residual_mm")
+    assert check["value"] < check["limit"] == 10
+    assert check["ok"] is True
+
+
+@pytest.mark.parametrize("exclude", ["99", "2:99"])
+def test_unknown_exclusion_is_an_error(tsgt: Tsgt, tmp_path: Path, exclude: str) -> None:
+    """A wrong number must not go unnoticed."""
+    done = tsgt("calibrate", "targets", documented(0, tmp_path), *TARGET_CONSTANT, "--exclude", exclude)
+    assert done.code == 1
+    assert "no measurement of target 99" in done.err
+
+
+def test_instrument_error_is_written(tsgt: Tsgt, tmp_path: Path) -> None:
+    """An index error of 0.3 mrad at station 2 is named, applied and written, with the joint covariance."""
+    field = TargetField(
+        rng=np.random.default_rng(1), errors={(1, InstrumentError.VERTICAL_INDEX): 3e-4}, both_faces=True
+    ).measure()
+    lines = ["station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m"]
+    lines += [
+        f"{station + 1},{target + 1},{h % (2 * np.pi)},{z},{d}"
+        for station, target, h, z, d in zip(
+            field.station, field.target, field.horizontal_rad, field.zenith_rad, field.distance_m, strict=True
+        )
+    ]
+    path, output = tmp_path / "index.csv", tmp_path / "frames.toml"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--output", output)
+    assert done.code == 0
+    assert "station 2: the residuals look like a vertical index error" in done.err
+    assert f"{output}: frames of stations 1, 2, 3, vertical_index_mrad of station 2" in done.out
+    written = load_station_calibration(output)
+    assert written.stations[2].vertical_index_rad == pytest.approx(3e-4, abs=2e-5)
+    assert written.covariance is not None
+    assert "station1.vertical_index" in written.covariance.components
 
 
 def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -105,6 +105,7 @@ class MasterLog:
         self._pose_measurements_before = array("q")
         self._pose_kinds = array("b")
         self._pose_numbers = array("d")
+        self._pose_sent_ages_s = array("d")
 
     def observe(self, record: object, line: bytes) -> None:
         """Log a published record and its line."""
@@ -136,13 +137,13 @@ class MasterLog:
         self._pose_numbers.append(np.nan if pose.residual_m is None else pose.residual_m)
         ages_s = (share.age_s for share in pose.stations if share.age_s is not None)
         self._pose_numbers.append(min(ages_s, default=np.nan))
-        self._pose_numbers.append((self._now_ns() + self.unix_at_zero_ns - pose.stamp_ns) / 1e9)
+        self._pose_sent_ages_s.append((self._now_ns() + self.unix_at_zero_ns - pose.stamp_ns) / 1e9)
         self._pose_numbers.extend(pose.covariance or ())
         self._pose_kinds.append(_KINDS.index(pose.kind))
 
     def valid_poses(self) -> ValidPoses:
         """Return the valid poses published so far."""
-        numbers = np.array(self._pose_numbers).reshape(-1, 46)
+        numbers = np.array(self._pose_numbers).reshape(-1, 45)
         return ValidPoses(
             stamp_ns=np.array(self._pose_stamps, dtype=np.int64),
             position_m=numbers[:, :3],
@@ -151,8 +152,8 @@ class MasterLog:
             measurements_before=np.array(self._pose_measurements_before, dtype=np.int64),
             kind=np.array(_KINDS)[np.array(self._pose_kinds, dtype=np.intp)],
             newest_age_s=numbers[:, 8],
-            sent_age_s=numbers[:, 9],
-            covariance=numbers[:, 10:].reshape(-1, 6, 6),
+            sent_age_s=np.array(self._pose_sent_ages_s),
+            covariance=numbers[:, 9:].reshape(-1, 6, 6),
         )
 
     def recording(self) -> Path | None:

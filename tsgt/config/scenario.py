@@ -135,6 +135,10 @@ class InstrumentModelConfig(Model):
     prism when it has lost its own."""
     prediction_s: NotNegative = 2.0
     """Duration of the prediction of an occluded prism, before the lock is lost."""
+    lock_drift_mmps: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Speed at which the line of sight drifts off the prism in the last second before it is lost."""
+    relock_error_mm: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Error across the line of sight right after a reacquisition; it settles with a time constant of 0.3 s."""
     baud: Annotated[int, Field(ge=2400, le=921_600)] = 115_200
     """Baud rate of its serial line."""
 

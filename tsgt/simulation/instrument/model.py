@@ -19,6 +19,7 @@ from tsgt.simulation.instrument.edm import (
     atmospheric_ppm,
     measure_polar,
 )
+from tsgt.simulation.instrument.lock_drift import LockDrift
 from tsgt.simulation.instrument.settings import COMPENSATOR_SIGMA_RAD, PRISM_CONSTANTS_M, TAPE, Settings
 from tsgt.simulation.instrument.targets_in_view import TargetsInView, direction_to
 from tsgt.simulation.instrument.telescope import Telescope
@@ -105,6 +106,7 @@ class TotalStationModel:
         self.telescope = Telescope(
             self._targets.prisms, prediction_s=model.prediction_s, now_s=self._world_s(now_ns)
         )
+        self._lock_drift = LockDrift(model, generator)
         self._select_target(station.prism)
         self.telescope.follow(station.prism)
         self._observation: TargetObservation | None = None
@@ -280,6 +282,12 @@ class TotalStationModel:
         if pointed is not None:
             true = direction_to(seen.point)
             horizontal, zenith = horizontal + pointed[0] - true[0], zenith + pointed[1] - true[1]
+        if seen.followed and seen.prism is not None:
+            right_m, down_m = self._lock_drift.offset_m(
+                self._targets.prisms[seen.prism], self._world_s(at_ns), self.telescope.locked_s
+            )
+            horizontal += right_m / (distance_m * max(math.sin(zenith), 1e-3))
+            zenith += down_m / distance_m
         horizontal, zenith = self.circle_reading((horizontal, zenith))
         settings = self.settings
         reflectorless = settings.edm_mode == REFLECTORLESS or settings.target_type == 1

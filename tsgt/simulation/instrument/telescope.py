@@ -50,6 +50,7 @@ class Telescope:
         self._speed_radps: PolarDirection = (0.0, 0.0)
         self.lock = Lock.OUT
         self.prism: int | None = None  # the prism it follows, or followed last
+        self.locked_s: float | None = None  # when it locked on again; None: not since the start
         self.target_id: int | None = None  # number of the only prism that it accepts; None: any
         self.blocked = False  # whether the line of sight is blocked; advance before changing it
         self.moving = False  # whether it is turning to another direction, and cannot measure
@@ -94,6 +95,7 @@ class Telescope:
 
     def follow(self, prism: int) -> None:
         """Lock on a prism."""
+        self.locked_s = None if self.prism is None else self._now_s
         self.lock, self.prism = Lock.IN, prism
 
     def nearest_prism(self, across_rad: float, up_rad: float) -> int | None:

@@ -167,6 +167,43 @@ async def test_angle_delay() -> None:
     assert max(map(abs, apart)) < 1e-9
 
 
+async def test_lock_drifts_before_a_loss_and_settles_after_it() -> None:
+    """The angles move away from the prism in the last second before an occlusion; after it their error decays."""
+    hidden = StatusFaultConfig(station=1, status="no_target", start_s=4.0, end_s=5.0)
+    scenario = ScenarioConfig(motion=STANDING, faults=(hidden,))
+    bench = Bench(
+        with_station(
+            scenario,
+            noise=SILENT,
+            rate_hz=10.0,
+            instrument={"lock_drift_mmps": 50.0, "relock_error_mm": 20.0, "tick_jitter_ms": 0.0},
+        )
+    )
+    await bench.do(*SETUP)
+    while bench.timeline.now_ns() < 9e9:
+        await bench.ask(2167, 200, 1)
+    reported = bench.instrument.reported_distances
+    x, y, z = bench.world.prism_at(np.array([0.0]), 0)[0]
+    distance_m = math.sqrt(x * x + y * y + z * z)
+    error_mm = [
+        1e3
+        * distance_m
+        * math.hypot(
+            (r.horizontal_angle_rad - math.atan2(-y, x) % math.tau) * math.hypot(x, y) / distance_m,
+            r.zenith_angle_rad - math.acos(z / distance_m),
+        )
+        for r in reported
+    ]
+    time_s = [r.true_ns / 1e9 for r in reported]
+    for at_s, error in zip(time_s, error_mm, strict=True):
+        if at_s < 4.0:
+            assert error == pytest.approx(50.0 * max(at_s - 3.0, 0.0), abs=1.1)
+        else:
+            assert error == pytest.approx(20.0 * math.exp(-(at_s - 5.0) / 0.3), abs=1.5)
+    assert max(error for at_s, error in zip(time_s, error_mm, strict=True) if at_s < 4.0) > 40.0
+    assert max(error for at_s, error in zip(time_s, error_mm, strict=True) if at_s > 4.0) > 10.0
+
+
 def _horizontal(bench: Bench, world_s: float) -> float:
     x, y, _ = bench.world.prism_at(np.array([world_s]), 0)[0]
     return math.atan2(-y, x) % math.tau

@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from tsgt.analysis.calibration import solve_stations, target_residuals
-from tsgt.analysis.formats import TargetFile, TargetMeasurement
+from tsgt.analysis.formats import InstrumentErrors, TargetFile, TargetMeasurement
 from tsgt.config import MotionConfig
 from tsgt.geometry import cartesian_to_polar, exp_so3, invert, transform_from, transform_points
 from tsgt.model import (
@@ -26,17 +25,15 @@ from tsgt.model import (
     Parameters,
     PolarMeasurement,
     PrismPosition,
-    SetupCovariance,
     StationParameters,
 )
 from tsgt.recording import Recording, RecordingHeader
 from tsgt.simulation.world import World
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import FrameCalibration
     from tsgt.model import InstrumentNoise, Matrix4, Measurement
 
 STATIONS = (1, 2, 3)
@@ -408,27 +405,27 @@ def _measure_targets(
 
 
 def calibrated(day: FieldDay) -> Recording:
-    """Return the recording with the station frames that its targets give."""
-    solved = solve_stations(day.targets, target_constant_m=CONSTANT_M).frames
-    stations = tuple(
-        station
-        if station.station == 1
-        else replace(
+    """Return the recording with what its targets give, as ``tsgt calibrate targets`` writes it."""
+    solved = solve_stations(day.targets, target_constant_m=CONSTANT_M)
+    errors = solved.instrument_errors()
+    stations = []
+    for station in day.recording.parameters.stations:
+        own = errors.get(station.station, InstrumentErrors())
+        changed = replace(
             station,
-            T_station1_station=cast("Matrix4", tuple(map(tuple, solved[station.station].T.tolist()))),
-            targets=target_residuals(solved[station.station]),
+            vertical_index_rad=own.vertical_index_rad or 0.0,
+            collimation_rad=own.collimation_rad or 0.0,
+            atmospheric_ppm=own.range_scale_ppm or 0.0,
         )
-        for station in day.recording.parameters.stations
+        if station.station != 1:
+            frame = solved.frames[station.station]
+            changed = replace(
+                changed,
+                T_station1_station=cast("Matrix4", tuple(map(tuple, frame.T.tolist()))),
+                targets=target_residuals(frame),
+            )
+        stations.append(changed)
+    parameters = replace(
+        day.recording.parameters, stations=tuple(stations), setup_covariance=solved.covariance
     )
-    parameters = replace(day.recording.parameters, stations=stations, setup_covariance=_covariance(solved))
     return replace(day.recording, parameters=parameters)
-
-
-def _covariance(solved: Mapping[int, FrameCalibration]) -> SetupCovariance:
-    """Covariance of the solved frames, which are taken as independent."""
-    axes = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
-    matrix = block_diag(*(each.covariance for each in solved.values()))
-    return SetupCovariance(
-        components=tuple(f"station{number}.{axis}" for number in solved for axis in axes),
-        matrix=tuple(map(tuple, (0.5 * (matrix + matrix.T)).tolist())),
-    )

@@ -27,6 +27,7 @@ def calibration_findings(parameters: Parameters) -> list[Finding]:
 
 def _targets(stations: Iterable[StationParameters]) -> list[Finding]:
     bad: dict[int, dict[int, float]] = {}  # by target and station, in m
+    kept: set[int] = set()
     for station in stations:
         residuals = sorted(each.residual_m for each in station.targets if each.residual_m is not None)
         usual = residuals[len(residuals) // 2] if len(residuals) >= MIN_TARGETS else math.inf
@@ -34,6 +35,8 @@ def _targets(stations: Iterable[StationParameters]) -> list[Finding]:
             size_m = max(each.residual_m or 0.0, each.leave_one_out_m or 0.0)
             if each.residual_m is None or (size_m > _LARGE_M and each.residual_m > _LARGE * usual):
                 bad.setdefault(each.target, {})[station.station] = size_m
+                if each.residual_m is not None:
+                    kept.add(each.target)
     if not bad:
         return []
     numbers = ", ".join(map(str, sorted(bad)))
@@ -50,9 +53,11 @@ def _targets(stations: Iterable[StationParameters]) -> list[Finding]:
             effect_mm=0.0,
             confidence=0.99,
             text=f"Target{'s' * plural} {numbers} contradict{'s' * (not plural)} the others by up to {largest_mm:.0f} mm, as seen by "
-            f"station{'s' * (len(seen) > 1)} {' and '.join(map(str, seen))}.",
-            repair=f"Solve the frames without: `tsgt calibrate targets TARGETS --exclude {','.join(map(str, sorted(bad)))}`.",
-            deciding_measurement="measure these targets again with all stations",
+            f"station{'s' * (len(seen) > 1)} {' and '.join(map(str, seen))}"
+            + ("." if kept else "; the frames were solved without."),
+            repair=f"Solve the frames without: `tsgt calibrate targets TARGETS --exclude {','.join(map(str, sorted(kept)))}`."
+            if kept
+            else "Nothing for this drive. Before the next one look whether a target has moved or was confused with another.",
             evidence={
                 str(target): {str(s): 1e3 * v for s, v in by_station.items()}
                 for target, by_station in sorted(bad.items())

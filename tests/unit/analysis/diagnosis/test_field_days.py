@@ -8,6 +8,7 @@ import pytest
 from harness.field_day import START_NS, Kind, calibrated, field_day
 
 from tsgt.analysis.diagnosis import diagnose
+from tsgt.analysis.diagnosis.target_findings import calibration_findings
 from tsgt.analysis.smoothing import estimate_motion_model
 from tsgt.estimation import build_observations
 
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.analysis.diagnosis import Finding
-
-pytestmark = pytest.mark.slow
 
 
 def findings_of(kinds: Sequence[Kind], seed: int) -> tuple[Finding, ...]:
@@ -29,11 +28,13 @@ def findings_of(kinds: Sequence[Kind], seed: int) -> tuple[Finding, ...]:
     return diagnose(recording.parameters, sources, motion, origin_ns=START_NS).findings
 
 
+@pytest.mark.slow
 def test_clean_day_has_no_findings() -> None:
     """Errors within the data sheets are no cause."""
     assert not findings_of([], 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "seed", "where"),
     [
@@ -48,3 +49,19 @@ def test_clean_day_has_no_findings() -> None:
 def test_fault_is_named(kind: Kind, seed: int, where: str) -> None:
     """The only finding is the planted fault, at its place."""
     assert [(each.cause, each.where) for each in findings_of([kind], seed)] == [(kind.value, where)]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [
+        ([], []),
+        ([Kind.VERTICAL_INDEX], [("vertical_index", "station 2")]),
+        ([Kind.FAR_TARGETS], [("targets", "targets 11, 12")]),
+    ],
+)
+def test_calibration_from_targets_tells_its_faults(
+    kinds: list[Kind], expected: list[tuple[str, str]]
+) -> None:
+    """What the targets of a day show is a finding of its recording."""
+    found = calibration_findings(calibrated(field_day(kinds, 2, duration_s=20.0)).parameters)
+    assert [(each.cause, each.where) for each in found] == expected

@@ -26,29 +26,35 @@ def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def evo_ape(
+def evo_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[Path, Path], tuple[int, float, float]]:
-    """Return what evo_ape says of a reference and a file: number, rms in m and in degrees, without 2 s at both ends."""
+) -> Callable[[Path, Path], tuple[int, float, float, float]]:
+    """Return what evo says of a reference and a file, without 2 s at both ends.
+
+    Number of poses, APE (rms) in m and in degrees, RPE (rms) in m over all pairs that are 1 m apart.
+    """
     monkeypatch.setenv("HOME", str(tmp_path))  # evo writes its settings there when it is first imported
     metrics = pytest.importorskip("evo.core.metrics")
     sync = pytest.importorskip("evo.core.sync")
     read = pytest.importorskip("evo.tools.file_interface").read_tum_trajectory_file
 
-    def ape(reference_path: Path, path: Path) -> tuple[int, float, float]:
+    def errors(reference_path: Path, path: Path) -> tuple[int, float, float, float]:
         reference, found = read(str(reference_path)), read(str(path))
         found.reduce_to_time_range(reference.timestamps[0] + 2.0, reference.timestamps[-1] - 2.0)
         pair = sync.associate_trajectories(reference, found, max_diff=1e-6)
 
-        def rms(relation: Any) -> float:
-            metric = metrics.APE(relation)
+        def rms(metric: Any) -> float:
             metric.process_data(pair)
             return float(metric.get_statistic(metrics.StatisticsType.rmse))
 
         relation = metrics.PoseRelation
-        return pair[0].num_poses, rms(relation.translation_part), rms(relation.rotation_angle_deg)
+        rpe = metrics.RPE(
+            relation.translation_part, delta=1.0, delta_unit=metrics.Unit.meters, all_pairs=True
+        )
+        ape = (metrics.APE(each) for each in (relation.translation_part, relation.rotation_angle_deg))
+        return pair[0].num_poses, *map(rms, ape), rms(rpe)
 
-    return ape
+    return errors
 
 
 @pytest.mark.parametrize("point", ["0,0,0", LIDAR], ids=["origin", "point"])
@@ -56,7 +62,7 @@ def evo_ape(
 def test_evo_agrees_with_evaluate(
     tsgt: Tsgt,
     recording: Path,
-    evo_ape: Callable[[Path, Path], tuple[int, float, float]],
+    evo_errors: Callable[[Path, Path], tuple[int, float, float, float]],
     estimator: str,
     point: str,
 ) -> None:
@@ -69,16 +75,21 @@ def test_evo_agrees_with_evaluate(
     other = files["continuous" if estimator == "linear" else "linear"]
     arguments = ["--estimator", estimator, "--reference", other, "--no-held-out", "--json", "--point", point]
     ours = tsgt("evaluate", recording, *arguments).json()
-    compared, position_m, rotation_deg = evo_ape(other, files[estimator])
+    compared, position_m, rotation_deg, relative_m = evo_errors(other, files[estimator])
     assert compared == ours["compared"] > 100
     assert ours["position_rms_mm"] > 0.5
     assert ours["position_rms_mm"] != pytest.approx(ours["centroid"]["position_rms_mm"], abs=0.1)
     assert position_m == pytest.approx(ours["position_rms_mm"] / 1e3, abs=1e-6)
     assert rotation_deg == pytest.approx(ours["orientation_rms_deg"], abs=1e-6)
+    assert ours["ate"]["position_rms_mm"] == pytest.approx(ours["position_rms_mm"], abs=1e-9)
+    (over_1_m,) = [
+        each for each in ours["rpe"] if (each["delta"], each["unit"], each["pairs"]) == (1.0, "m", "all")
+    ]
+    assert relative_m == pytest.approx(over_1_m["position_rms_mm"] / 1e3, abs=1e-6)
 
 
 def test_reference_of_the_robot_is_carried_over(
-    tsgt: Tsgt, recording: Path, evo_ape: Callable[[Path, Path], tuple[int, float, float]]
+    tsgt: Tsgt, recording: Path, evo_errors: Callable[[Path, Path], tuple[int, float, float, float]]
 ) -> None:
     """A reference of the robot's origin and poses of another point are compared at the latter, as both files there are."""
     plain, at_point, found = (recording.with_name(f"{name}.tum") for name in ("plain", "at_point", "found"))
@@ -89,7 +100,7 @@ def test_reference_of_the_robot_is_carried_over(
     assert tsgt("process", recording, "--point", LIDAR, "--output", found).code == 0
     arguments = ["--no-held-out", "--json", "--point", LIDAR, "--reference"]
     ours = tsgt("evaluate", recording, *arguments, plain).json()
-    _, position_m, rotation_deg = evo_ape(at_point, found)
+    _, position_m, rotation_deg, _ = evo_errors(at_point, found)
     assert position_m == pytest.approx(ours["position_rms_mm"] / 1e3, abs=1e-6)
     assert rotation_deg == pytest.approx(ours["orientation_rms_deg"], abs=1e-6)
 

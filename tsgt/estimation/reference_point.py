@@ -25,7 +25,6 @@ from tsgt.geometry import (
     skew,
     transform_from,
 )
-from tsgt.geometry.rigid import cross
 from tsgt.geometry.trajectory import with_second_order_terms
 from tsgt.model import ROBOT_FRAME, ReferencePoint
 
@@ -143,7 +142,7 @@ def _motion_at(
     turn = T[:3, :3]
     if not np.array_equal(turn, np.eye(3)):
         orientation = quaternion_from_rotation(rotation @ turn)
-    velocity = velocity + rotate(rotation, cross(rate, np.broadcast_to(T[:3, 3], rate.shape)))
+    velocity = velocity + rotate(rotation, rotate(skew(rate), T[:3, 3]))
     return arm_m, (position + arm_m, orientation, velocity, rotate(turn.T, rate))
 
 

@@ -98,13 +98,17 @@ class NetworkCalibration:
 
     @property
     def unidentified(self) -> tuple[Cause, ...]:
-        """Selected sights for which the readings do not exclude another target or an instrument error."""
+        """Selected sights for which the readings do not exclude another target or an instrument error, and the reverse.
+
+        Instrument errors within the data sheet are no surprise.
+        """
         return tuple(
             cause
             for cause in self.causes
             if (cause.kind is CauseKind.SIGHT and any(_differs(cause, other) for other in cause.alternatives))
             or (
                 cause.kind in (CauseKind.INSTRUMENT, CauseKind.TARGET_CONSTANT)
+                and not cause.within_data_sheet
                 and any(other.kind is CauseKind.SIGHT for other in cause.alternatives)
             )
         )

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.records import CLOCK, EVENT, STATUS, measurement
+from harness.records import CLOCK, EVENT, PARAMETERS, POSE, STATUS, measurement
 from scipy.spatial.transform import Rotation
 
 from tsgt.cli.render import render, yaw_pitch_roll_deg
-from tsgt.recording import encode_line
+from tsgt.model import PipelineParameters
+from tsgt.recording import HelloRecord, ValidityLimits, encode_line
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -33,6 +34,30 @@ def test_measurement_without_distance_says_so() -> None:
     text = render("measurement", encode_line(replace(measurement(0), slope_distance_m=None)))
     assert text is not None
     assert "no distance" in text
+
+
+def test_greeting_states_the_limits_of_both_kinds() -> None:
+    """With the estimator linear there are none."""
+    limits = PipelineParameters(
+        position_sigma_limit_m=0.03, predicted_rotation_sigma_limit_rad=math.radians(4)
+    )
+    text = render(
+        "hello", encode_line(HelloRecord(limits=ValidityLimits.of(replace(PARAMETERS, pipeline=limits))))
+    )
+    assert text is not None
+    assert text.endswith("Limits at robot: smoothed 30 mm, 2 deg; predicted 150 mm, 4 deg.")
+    linear = ValidityLimits.of(replace(PARAMETERS, pipeline=PipelineParameters(estimator="linear")))
+    text = render("hello", encode_line(HelloRecord(limits=linear)))
+    assert text is not None
+    assert "Limits" not in text
+
+
+def test_degraded_pose_says_by_what() -> None:
+    """Beside its validity."""
+    degraded = replace(POSE, quality="degraded", degraded_by=("old_measurements", "uncertain"))
+    text = render("pose", encode_line(degraded))
+    assert text is not None
+    assert "valid, degraded (old_measurements, uncertain)" in text
 
 
 def test_clock_text_has_the_sign_in_words() -> None:

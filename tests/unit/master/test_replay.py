@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import EVENT, HEADER
+from harness.records import EVENT, HEADER, PARAMETERS, measurement, recording_bytes
 from harness.scene import START, stationary_scene
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import LiveEstimator
-from tsgt.master.replay import replay, replayed
+from tsgt.master.replay import greeting, replay, replayed
 from tsgt.master.stream_server import StreamServer
-from tsgt.recording import RecordingWriter, encode_line
+from tsgt.recording import RecordingWriter, ValidityLimits, encode_line
 from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
@@ -136,3 +136,10 @@ async def test_speed_changes_the_pace_only(tmp_path: Path, speed: float, lasts_s
     assert received[1:] == lines
     assert published == len(lines)
     assert (ended_ns - began_ns) / 1e9 == pytest.approx(lasts_s, abs=0.2)
+
+
+def test_greeting_has_the_limits_of_the_first_session(tmp_path: Path) -> None:
+    """A replay promises what the recorded stream promised."""
+    path = tmp_path / "r.jsonl"
+    path.write_bytes(recording_bytes(measurement(0)))
+    assert greeting(path).limits == ValidityLimits.of(PARAMETERS)

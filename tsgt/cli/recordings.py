@@ -11,6 +11,7 @@ import numpy as np
 
 import tsgt
 from tsgt.analysis.evaluation import noise_scales_by_axis, read_tum
+from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.setup_replacement import with_calibration, with_layout
 from tsgt.cli.options import path_type
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.evaluation import Reference
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.smoothing import MotionModel, SmoothedRecording
+    from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.estimation import PoseBatch
-    from tsgt.model import Parameters, ReferencePoint
+    from tsgt.model import MotionPrior, Parameters, ReferencePoint
     from tsgt.recording import Recording
 
 estimator_option = click.option(
@@ -126,21 +127,29 @@ def motion_keys(found: SmoothedRecording) -> dict[str, Any]:
         "noise_scale": motion.noise_scale,
         "noise_scales": noise_scales_by_axis(found.fit, found.sources),
         "motion_tuned": motion.tuned,
+        "motion_unfit_for_live": unfit_for_live(found),
     }
 
 
-def motion_text(motion: MotionModel) -> str:
-    """Return motion prior and noise scale as they are written in a master's configuration."""
-    values = {
-        key: "[" + ", ".join(f"{v:.3g}" for v in value) + "]" if isinstance(value, tuple) else f"{value:.3g}"
-        for key, value in dataclasses.asdict(motion.prior).items()
-    }
+def motion_text(found: SmoothedRecording, configured: MotionPrior) -> str:
+    """Return motion prior and noise scale as they are written in a master's configuration; ``configured``: as recorded."""
+    motion = found.motion
     origin = "tuned to the measurements" if motion.tuned else "as recorded: too few measurements to tune it"
     lines = [
         f"Motion prior, {origin}:",
         "  [pipeline]",
         f"  noise_scale = {motion.noise_scale:.3g}",
-        "  [pipeline.motion]",
-        *(f"  {key} = {value}" for key, value in values.items()),
+        *_motion_lines(motion.prior),
     ]
+    reasons = unfit_for_live(found)
+    if reasons:
+        lines += [f"Not for live use: {'; '.join(reasons)}. Keep", *_motion_lines(configured)]
     return "\n".join(lines)
+
+
+def _motion_lines(prior: MotionPrior) -> list[str]:
+    values = {
+        key: "[" + ", ".join(f"{v:.3g}" for v in value) + "]" if isinstance(value, tuple) else f"{value:.3g}"
+        for key, value in dataclasses.asdict(prior).items()
+    }
+    return ["  [pipeline.motion]", *(f"  {key} = {value}" for key, value in values.items())]

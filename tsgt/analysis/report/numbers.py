@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.evaluation import noise_scales_by_axis
+from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.report.calibration import calibration_numbers
 from tsgt.analysis.report.diagnosis_section import diagnosis_numbers
 from tsgt.analysis.report.findings import position_sigma_mm, rotation_sigma_deg
@@ -76,6 +77,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
             "noise_scale": motion.noise_scale,
             "noise_scales": noise_scales_by_axis(f.continuous.fit, f.continuous.sources),
             "motion_tuned": motion.tuned,
+            "motion_unfit_for_live": unfit_for_live(f.continuous),
             "residuals": {
                 station: {axis: dataclasses.asdict(each) for axis, each in axes.items()}
                 for station, axes in f.residuals.items()

@@ -216,7 +216,7 @@ def evaluate(
     if predicted is not None:
         click.echo("\nHeld-out prediction error (mm)")
         _print_held_out(predicted)
-    click.echo(f"\n{motion_text(continuous.motion)}")
+    click.echo(f"\n{motion_text(continuous, parameters.pipeline.motion)}")
     click.echo("\nNormalised residuals of the continuous trajectory")
     rows = [
         [f"{station} {axis.replace('_', ' ')}", str(f.n), *numbers(f.mean, f.std), f"{f.beyond_3_sigma:.2%}"]

@@ -131,7 +131,7 @@ def process(
     at = point_label(poses.reference_point)
     click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements, at {at}")
     if continuous is not None:
-        click.echo(motion_text(continuous.motion))
+        click.echo(motion_text(continuous, loaded.parameters.pipeline.motion))
         click.echo(f"At rest: {continuous.fit.rest_s:.1f} s in {len(continuous.fit.rest)} intervals")
 
 

@@ -27,6 +27,15 @@ AGE_EDGES_S = (0.0, 0.2, 0.4, 0.6, 1.0, np.inf)
 ABOVE = (22.46, 38.26)
 
 
+def print_sigmas(kind: str, poses: list[PoseRecord]) -> None:
+    """Print percentiles of the sigmas at the reference point, each in its least certain direction."""
+    covariance = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
+    for name, part, unit in (("mm", slice(0, 3), 1e3), ("degrees", slice(3, 6), np.degrees(1.0))):
+        sigmas = unit * np.sqrt(np.linalg.eigvalsh(covariance[:, part, part])[:, -1])
+        p50, p99 = np.percentile(sigmas, [50, 99])
+        print(f"sigmas of {kind} poses, {name}: median {p50:.3g}, p99 {p99:.3g}, largest {sigmas.max():.3g}")
+
+
 def main() -> None:
     """Print the figures of one recording."""
     recording, truth = Path(sys.argv[1]), Path(sys.argv[2])
@@ -34,8 +43,11 @@ def main() -> None:
         decode(PoseRecord, line)
         for _, lines in replayed(recording)
         for line in lines
-        if line.startswith(b'{"type":"pose"') and b'"kind":"predicted"' in line
+        if line.startswith(b'{"type":"pose"')
     ]
+    for kind in ("predicted", "smoothed"):
+        print_sigmas(kind, [pose for pose in poses if pose.valid and pose.kind == kind])
+    poses = [pose for pose in poses if pose.kind == "predicted"]
     valid = [pose for pose in poses if pose.valid]
     reference = read_tum(truth).of_point(ROBOT_ORIGIN)
     stamp_ns = np.array([pose.stamp_ns for pose in valid])

@@ -49,6 +49,7 @@ from tsgt.analysis.evaluation.metrics import (
 )
 from tsgt.analysis.evaluation.normalised_prediction import (
     NormalisedErrorStatistics,
+    near_loss,
     normalised_by_axis,
     normalised_prediction_errors,
 )
@@ -111,6 +112,7 @@ __all__ = [
     "inter_prism",
     "interior_mask",
     "interpolation_errors",
+    "near_loss",
     "newest_age_s",
     "noise_scales_by_axis",
     "normalised_by_axis",

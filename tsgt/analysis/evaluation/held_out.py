@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation.normalised_prediction import normalised_prediction_errors
+from tsgt.analysis.evaluation.normalised_prediction import near_loss, normalised_prediction_errors
 from tsgt.analysis.smoothing import estimate_motion_model
 from tsgt.geometry.trajectory import fit_trajectory, scale_noise
 
@@ -177,6 +177,7 @@ def held_out_errors(
         )
     done = 0
     normalised = []
+    near = near_loss(observations.time_s, observations.station)
 
     def smoothing_errors(fold: Fold) -> FloatArray:
         nonlocal done
@@ -191,7 +192,9 @@ def held_out_errors(
         )
         test = observations.select(fold.test)
         normalised.append(
-            normalised_prediction_errors(found.trajectory, scale_noise(test, motion.noise_scales))
+            normalised_prediction_errors(
+                found.trajectory, scale_noise(test, motion.noise_scales), near[fold.test]
+            )
         )
         return trajectory_errors(found.trajectory, test)
 

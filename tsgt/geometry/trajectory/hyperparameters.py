@@ -61,9 +61,11 @@ _TIME_PARAMETERS = (2, 5)
 _SCALE_PARAMETER = (
     6  # Common factor on the noise; followed by each station's and component's deviation from it
 )
-_LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03, 0.5])
+_LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03, 0.7])
 _UPPER = np.log([30.0, 30.0, 10.0, 30.0, 30.0, 10.0, 20.0])
-_MAX_DEVIATION = np.log(10.0)
+# A prior of white acceleration follows every measurement if it may, and then there seems to be no noise. No instrument is
+# better than half its data sheet.
+_DEVIATION_LIMITS = np.log([0.7, 10.0])
 _ADAPTED_ITERATIONS = 2  # The next adaptation need not wait for convergence
 _TIME_SCALE_LIMITS = np.log([0.05, 1.0])
 _MEDIAN_SQUARED_DISTANCE = 2.37  # Of the chi-square distribution with 3 degrees of freedom
@@ -156,9 +158,9 @@ def tune(
     """
     scales = np.ones((len(observations.frames), 3)) * (1.0 if noise_scale is None else noise_scale)
     initial = log_parameters(MotionPrior() if start is None else start, scales)
-    deviations = np.full(scales.size, _MAX_DEVIATION)
-    lower = np.minimum(np.concatenate([_LOWER, -deviations, _TIME_SCALE_LIMITS[:1]]), initial)
-    upper = np.maximum(np.concatenate([_UPPER, deviations, _TIME_SCALE_LIMITS[1:]]), initial)
+    lowest, highest = np.repeat(_DEVIATION_LIMITS[:, None], scales.size, axis=1)
+    lower = np.minimum(np.concatenate([_LOWER, lowest, _TIME_SCALE_LIMITS[:1]]), initial)
+    upper = np.maximum(np.concatenate([_UPPER, highest, _TIME_SCALE_LIMITS[1:]]), initial)
     if noise_scale is not None:
         lower[_SCALE_PARAMETER:] = upper[_SCALE_PARAMETER:] = initial[_SCALE_PARAMETER:]
     if noise_only:

@@ -25,7 +25,13 @@ from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.noise_scales import scale_noise
 from tsgt.geometry.trajectory.query import Trajectory
-from tsgt.geometry.trajectory.rest import RestInterval, rest_factors, steps_in_rest, with_vibration
+from tsgt.geometry.trajectory.rest import (
+    RestInterval,
+    add_vibration,
+    rest_factors,
+    steps_in_rest,
+    with_vibration,
+)
 from tsgt.geometry.trajectory.rest_detection import find_rest
 from tsgt.geometry.trajectory.states import concatenate_states
 from tsgt.model import MotionPrior
@@ -148,13 +154,10 @@ def fit_trajectory(
         squared_distances.append(solution.squared_distances[kept])
         weights.append(solution.weights[kept])
     report_progress(1.0)
-    trajectory = Trajectory(
-        concatenate_states(knots),
-        prior,
-        np.concatenate(covariances),
-        np.concatenate(cross_covariances)[: len(times_s) - 1],
-        adapted,
-    )
+    covariance = np.concatenate(covariances)
+    cross_covariance = np.concatenate(cross_covariances)[: len(times_s) - 1]
+    add_vibration(rest, times_s, observations.layout, covariance, cross_covariance)
+    trajectory = Trajectory(concatenate_states(knots), prior, covariance, cross_covariance, adapted)
     return TrajectoryFit(
         trajectory,
         observations,

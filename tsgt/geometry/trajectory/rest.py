@@ -31,7 +31,7 @@ class RestInterval(NamedTuple):
 
     start_s: float
     end_s: float
-    vibration_m: float  # One sigma per axis of the vibration of the prisms
+    vibration_m: float  # One sigma per axis of the vibration of the prisms, as far as it is significant
 
 
 def in_rest(intervals: Sequence[RestInterval], time_s: FloatArray) -> NDArray[np.intp]:
@@ -61,13 +61,39 @@ def rest_factors(
     at_rest = steps_in_rest(intervals, knots_s)
     if not at_rest.any():
         return sigmas, None
-    lever_m = float(np.sqrt(np.mean(np.sum(layout**2, axis=1))))
+    lever_m = _lever_m(layout)
     by_axis = np.repeat([1.0, 1.0 / lever_m], 3)
     half_step_s = 0.5 * np.diff(knots_s)[:, None]
     return (
         np.where(at_rest[:, None], ACCELERATION_SIGMA_MPS2 * by_axis, sigmas),
         np.where(at_rest[:, None], half_step_s / (WANDER_M * by_axis) ** 2, 0.0),
     )
+
+
+def add_vibration(
+    intervals: Sequence[RestInterval],
+    knots_s: FloatArray,
+    layout: FloatArray,
+    covariance: FloatArray,
+    cross_covariance: FloatArray,
+) -> None:
+    """Add the vibration at rest to the poses' covariances of a trajectory, (K, 18, 18), (K - 1, 18, 18), in place.
+
+    The trajectory is that of the mean. A robot that rocks within what looks like vibration is off the mean by that much.
+    """
+    vibration_m2 = np.array([*(each.vibration_m**2 for each in intervals), 0.0])
+    by_component = np.repeat([1.0, _lever_m(layout) ** -2.0], 3)
+    at_knots = vibration_m2[in_rest(intervals, knots_s)]
+    at_steps = np.where(steps_in_rest(intervals, knots_s), at_knots[1:], 0.0)
+    components = np.arange(6)
+    covariance[:, components, components] += at_knots[:, None] * by_component
+    # The same error at both ends of a step, so that it is as large in between.
+    cross_covariance[:, components, components] += at_steps[:, None] * by_component
+
+
+def _lever_m(layout: FloatArray) -> float:
+    """Root mean square distance of the prisms from the reference point."""
+    return float(np.sqrt(np.mean(np.sum(layout**2, axis=1))))
 
 
 def steps_in_rest(intervals: Sequence[RestInterval], knots_s: FloatArray) -> NDArray[np.bool_]:

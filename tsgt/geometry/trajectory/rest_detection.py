@@ -9,7 +9,7 @@ white at the rate of the measurements. See docs/explanation/continuous-trajector
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2, f
@@ -35,6 +35,8 @@ the trends. Its limit is about 20 for three series: one window of such a robot i
 
 TREND_SIGNIFICANCE = 0.03  # A window of rest that fails costs little: the windows overlap
 MIN_WHITENESS_SIGMAS = 3.0
+STEADY_WINDOWS_S = (6.0, 9.0)  # Within a run of shorter ones that look like rest: these tell a slow sway
+WANDER_MPS = 1e-3  # Trend that is allowed in them: a robot sinks into snow
 MAX_VIBRATION_M = 4e-3
 MIN_SCATTER = 0.25  # Variance over the stated one; less is taken for chance
 MAX_GAP_S = 1.0  # Between successive measurements of any prism
@@ -90,10 +92,12 @@ def find_rest_in_series(series: Series) -> list[RestInterval]:
     series = series.select(~_outliers(series))
     found = []
     for start, stop in _runs(_window_ends(series)):
-        part = _without_moved_ends(series.select(slice(start, stop)))
-        start_s, end_s = float(part.time_s[0]) + MARGIN_S, float(part.time_s[-1]) - MARGIN_S
-        if end_s - start_s >= MIN_DURATION_S:
-            found.append(RestInterval(start_s, end_s, _vibration_m(part)))
+        run = _without_moved_ends(series.select(slice(start, stop)))
+        for steady in _steady_runs(run):
+            part = run.select(slice(*steady))
+            start_s, end_s = float(part.time_s[0]) + MARGIN_S, float(part.time_s[-1]) - MARGIN_S
+            if end_s - start_s >= MIN_DURATION_S:
+                found.append(RestInterval(start_s, end_s, _vibration_m(part)))
     return found
 
 
@@ -187,6 +191,19 @@ class _Windows:
         self, starts: NDArray[np.intp], stops: NDArray[np.intp]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Whether windows could tell a creep, and whether they can and the robot was at rest in them."""
+        found = self._statistics(starts, stops)
+        conclusive = CREEP_MPS**2 * found.creep >= MIN_CREEP_CHI2 * found.scatter
+        white = _is_white(found.steps, found.about_mean, found.freedom)
+        weak = found.vibration_m2 < MAX_VIBRATION_M**2
+        return conclusive, conclusive & (found.trend < found.trend_limit) & white & weak
+
+    def steady(self, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Whether the motion in windows is a slow wander at most: neither faster nor swaying."""
+        found = self._statistics(starts, stops)
+        slow = found.trend < found.trend_limit + WANDER_MPS**2 * found.creep
+        return slow & _is_white(found.steps, found.about_mean - found.trend, found.freedom)
+
+    def _statistics(self, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> _Statistics:
         number, w, wt, wtt, wy, wty, wyy, _, precision, units = self._sums[:, stops] - self._sums[:, starts]
         # The first step of each series begins before the window.
         first = np.minimum(self._next[starts] + 1, stops[:, None])
@@ -195,29 +212,66 @@ class _Windows:
         used = number >= 3
         safe_w = np.where(used, w, 1.0)
         spread = np.where(used, wtt - wt**2 / safe_w, 1.0)
-        trend = np.where(used, (wty - wt * wy / safe_w) ** 2 / spread, 0.0)
-        about_mean = np.where(used, wyy - wy**2 / safe_w, 0.0)
+        trend = np.where(used, (wty - wt * wy / safe_w) ** 2 / spread, 0.0).sum(axis=(1, 2))
+        about_mean = np.where(used, wyy - wy**2 / safe_w, 0.0).sum(axis=(1, 2))
 
         def total(each: FloatArray) -> FloatArray:
             return np.asarray(np.where(used, each, 0.0).sum(axis=(1, 2)))
 
-        trends, freedom = used.sum(axis=(1, 2)), total(number - 1.0)
-        safe_freedom = np.maximum(freedom - trends, 1.0)
-        scatter = (about_mean - trend).sum(axis=(1, 2)) / safe_freedom
-        plausible_scatter = np.maximum(scatter, MIN_SCATTER)
-        creep = CREEP_MPS**2 * np.where(used, spread * units / np.maximum(number, 1), 0.0).sum(axis=1).min(
-            axis=1
+        trends, freedom = np.maximum(used.sum(axis=(1, 2)), 1), total(number - 1.0)
+        remaining = np.maximum(freedom - trends, 1.0)
+        variance = (about_mean - trend) / remaining
+        scatter = np.maximum(variance, MIN_SCATTER)
+        return _Statistics(
+            trend,
+            scatter * trends * f.isf(TREND_SIGNIFICANCE, trends, remaining),
+            about_mean,
+            total(steps),
+            freedom,
+            scatter,
+            np.where(used, spread * units / np.maximum(number, 1), 0.0).sum(axis=1).min(axis=1),
+            (variance - 1.0) / np.maximum(total(precision) / np.maximum(total(number), 1.0), 1e-9),
         )
-        conclusive = creep >= MIN_CREEP_CHI2 * plausible_scatter
-        no_trend = trend.sum(axis=(1, 2)) < plausible_scatter * np.maximum(trends, 1) * f.isf(
-            TREND_SIGNIFICANCE, np.maximum(trends, 1), safe_freedom
-        )
-        # Von Neumann's ratio: successive differences against the scatter about the mean.
-        least = MIN_SCATTER * freedom  # Less is taken for chance, and nothing is left to be correlated
-        ratio = np.maximum(total(steps), least) / np.maximum(about_mean.sum(axis=(1, 2)), least + 1e-9)
-        white = ratio > 1.0 - MIN_WHITENESS_SIGMAS / np.sqrt(np.maximum(freedom, 1.0))
-        vibration_m2 = (scatter - 1.0) / np.maximum(total(precision) / np.maximum(total(number), 1.0), 1e-9)
-        return conclusive, conclusive & no_trend & white & (vibration_m2 < MAX_VIBRATION_M**2)
+
+
+class _Statistics(NamedTuple):
+    """Statistics of N windows, (N,) each."""
+
+    trend: FloatArray  # Chi-square of the trends
+    trend_limit: FloatArray
+    about_mean: FloatArray  # Chi-square of the scatter about the means
+    steps: FloatArray  # Sum of the squared, normalised differences of successive measurements
+    freedom: FloatArray  # Of the last two
+    scatter: FloatArray  # Variance about the trends over the stated one
+    creep: FloatArray  # Chi-square that a speed of 1 m/s would add to the trends, in the direction that is measured worst
+    vibration_m2: FloatArray
+
+
+def _is_white(steps: FloatArray, scatter: FloatArray, freedom: FloatArray) -> NDArray[np.bool_]:
+    """Von Neumann's ratio: successive differences against the scatter, both about ``freedom`` if there is no correlation."""
+    least = MIN_SCATTER * freedom  # Less is taken for chance, and nothing is left to be correlated
+    ratio = np.maximum(steps, least) / np.maximum(scatter, least + 1e-9)
+    white: NDArray[np.bool_] = ratio > 1.0 - MIN_WHITENESS_SIGMAS / np.sqrt(np.maximum(freedom, 1.0))
+    return white
+
+
+def _steady_runs(part: Series) -> Iterator[tuple[int, int]]:
+    """Slices of the rows of a run that no long window contradicts: short ones do not tell a slow sway."""
+    count = len(part)
+    contradicted = np.zeros(count + 1, np.intp)
+    for first in range(0, count, _CHUNK):
+        starts = np.arange(min(_CHUNK, count - first))
+        last_s = part.time_s[first + starts[-1]] + WINDOWS_S[-1] + MAX_GAP_S
+        windows = _Windows(part.select(slice(first, int(np.searchsorted(part.time_s, last_s)))))
+        for length_s in STEADY_WINDOWS_S:
+            stops = windows.stops(starts, length_s)
+            begun, ended = starts[stops > 0], stops[stops > 0]
+            swaying = ~windows.steady(begun, ended)
+            np.add.at(contradicted, first + begun[swaying], 1)
+            np.add.at(contradicted, first + ended[swaying], -1)
+    kept = np.concatenate([[False], np.cumsum(contradicted[:-1]) == 0, [False]])
+    changes = np.flatnonzero(kept[1:] != kept[:-1]).tolist()
+    yield from zip(changes[::2], changes[1::2], strict=True)
 
 
 def _without_moved_ends(part: Series) -> Series:
@@ -257,12 +311,15 @@ def _moved_from(part: Series) -> int:
 
 
 def _vibration_m(part: Series) -> float:
-    """One sigma per axis of the scatter that the stated noise does not explain."""
-    excess = freedom = 0.0
+    """One sigma of the scatter that the stated noise does not explain, in the coordinate in which it is largest.
+
+    Only as far as it is significant: two standard deviations of the scatter's estimate are subtracted.
+    """
+    excess, freedom, precision = np.zeros(3), 0.0, np.zeros(3)
     for number in np.unique(part.series):
         own = part.select(part.series == number)
-        excess += float((((own.values - own.values.mean(axis=0)) / own.sigmas) ** 2).sum()) - 3 * (
-            len(own) - 1
-        )
-        freedom += float((own.sigmas_m**-2.0).sum()) * (1 - 1 / len(own))
-    return float(np.sqrt(max(excess / freedom, 0.0))) if freedom else 0.0
+        excess += (((own.values - own.values.mean(axis=0)) / own.sigmas) ** 2).sum(axis=0) - (len(own) - 1)
+        freedom += len(own) - 1
+        precision += (own.sigmas_m**-2.0).sum(axis=0) * (1 - 1 / len(own))
+    significant = (excess - 2.0 * np.sqrt(2.0 * freedom)) / np.maximum(precision, 1e-9)
+    return float(np.sqrt(max(significant.max(), 0.0)))

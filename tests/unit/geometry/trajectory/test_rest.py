@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from harness.prior_motion import CENTRE_M
@@ -13,6 +15,9 @@ from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.rest import RestInterval, in_rest, rest_factors, steps_in_rest, with_vibration
 from tsgt.geometry.trajectory.states import STATE_DIM, ProcessFactors
 from tsgt.model import MotionPrior
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
 
 PRIOR = MotionPrior()
 INTERVALS = [RestInterval(2.0, 5.0, 0.0), RestInterval(5.5, 7.0, 0.002)]
@@ -99,3 +104,19 @@ def test_wander_is_followed() -> None:
     states, _ = found.trajectory.at(at_s, dim=6)
     along = (states.position - CENTRE_M)[:, :2] @ LINE_OF_SIGHT - 3e-4 * at_s
     assert np.sqrt(np.mean(along**2)) < 1e-3
+
+
+def test_rocking_is_within_the_covariance() -> None:
+    """A robot that rocks by two millimetres looks like one that vibrates: its poses say how far off the mean it may be."""
+
+    def rocking(time_s: FloatArray) -> FloatArray:
+        return 2e-3 * np.sin(2 * np.pi * time_s)
+
+    at_s = np.linspace(3.0, 37.0, 69)
+    found = fit_trajectory(measure_along(rocking, until_s=40.0, seed=5), prior=PRIOR, noise_scale=1.0)
+    states, covariance = found.trajectory.at(at_s, dim=6)
+    error = states.position - CENTRE_M
+    error[:, :2] -= rocking(at_s)[:, None] * LINE_OF_SIGHT
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance[:, :3, :3]), error)
+    assert found.rest_s > 30.0
+    assert nees.mean() < 5.0

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.validation import (
     check_prisms_measured,
     check_time_span,
@@ -22,6 +23,7 @@ from tsgt.estimation import (
     measured_at_ns,
     noise_scales,
     usable,
+    with_setup,
 )
 from tsgt.geometry import check_layout
 from tsgt.geometry.trajectory import NOISE_FLOOR_SHARE, fit_trajectory, overall_scale, tune, with_noise_floor
@@ -30,7 +32,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from tsgt.analysis.refinement import Refine
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.calibration import RefinedSetup
     from tsgt.geometry.trajectory import Observations, TrajectoryFit
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
@@ -63,12 +67,18 @@ class SmoothedRecording:
     motion: MotionModel
     sources: list[Measurement]
     origin_ns: int
+    parameters: Parameters  # of the recording, with the set-up that was used
+    refinement: RefinedSetup | None  # None: switched off or not possible
 
 
 def smooth_recording(
-    recording: Recording, *, path: Path, on_progress: Callable[[float], None] | None = None
+    recording: Recording,
+    *,
+    path: Path,
+    refine: Refine = "auto",
+    on_progress: Callable[[float], None] | None = None,
 ) -> SmoothedRecording:
-    """Fit a smooth trajectory to all measurements of a recording.
+    """Fit a smooth trajectory to all measurements of a recording, with its set-up or, where they contradict it, a refined one.
 
     The hyperparameters are estimated from the measurements. Those of the recording, which the live estimator used, bound the
     process noise: at least a third of them, and all of them while prisms are occluded. Progress is a fraction, 0 to 1.
@@ -83,6 +93,13 @@ def smooth_recording(
     origin_ns = min(m.stamp_ns for m in measurements)
     observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
     motion = estimate_motion_model(observations, parameters.pipeline, recorded=noise_scales(parameters))
+    refined = None
+    if motion.tuned:
+        refined = refine_recorded_setup(parameters, observations, motion.prior, motion.noise_scales, refine)
+    if refined is not None and refined.used:
+        parameters = with_setup(parameters, refined.parameters, refined.setup, refined.covariance)
+        observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
+        motion = estimate_motion_model(observations, parameters.pipeline, start=refined.motion_prior)
     try:
         found = fit_trajectory(
             observations,
@@ -96,18 +113,23 @@ def smooth_recording(
     poses = _poses(found, parameters, measurements, sources, origin_ns)
     if not poses.valid.any():
         raise RecordingError(no_valid_pose_message(poses, parameters), path=path)
-    return SmoothedRecording(poses, found, motion, sources, origin_ns)
+    return SmoothedRecording(poses, found, motion, sources, origin_ns, parameters, refined)
 
 
 def estimate_motion_model(
-    observations: Observations, pipeline: PipelineParameters, *, recorded: FloatArray | None = None
+    observations: Observations,
+    pipeline: PipelineParameters,
+    *,
+    recorded: FloatArray | None = None,
+    start: MotionPrior | None = None,
 ) -> MotionModel:
     """Estimate the hyperparameters, with a floor on the process noise; too few measurements: return those of ``pipeline``.
 
-    ``recorded``: noise scales, (S + 1, 3), for that case; by default the factor of ``pipeline`` for all.
+    ``recorded``: noise scales, (S + 1, 3), for that case; by default the factor of ``pipeline`` for all. ``start``: prior near the
+    result, which saves time.
     """
     try:
-        tuned = tune(observations)
+        tuned = tune(observations, start=start)
     except GeometryError:
         scales = (
             np.full((len(observations.frames), 3), pipeline.noise_scale) if recorded is None else recorded

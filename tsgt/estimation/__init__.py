@@ -25,6 +25,7 @@ from tsgt.estimation.reference_point import (
     transform_between,
     transform_of,
 )
+from tsgt.estimation.setup_uncertainty import parameter_names, stated_covariance, with_setup
 from tsgt.estimation.tracks import (
     MAX_DISTANCE_M,
     Track,
@@ -54,14 +55,17 @@ __all__ = [
     "instrument_time_sigma_s",
     "measured_at_ns",
     "noise_scales",
+    "parameter_names",
     "parse_reference_point",
     "point_label",
     "poses_at",
     "records_at",
     "reference_point_text",
     "sigma_limits_of",
+    "stated_covariance",
     "transform_between",
     "transform_of",
     "usable",
     "with_noise_scales",
+    "with_setup",
 ]

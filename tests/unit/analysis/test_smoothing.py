@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from tsgt.recording import Recording, RecordingHeader
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.model import Measurement, Parameters, PolarMeasurement
+    from tsgt.model import Matrix4, Measurement, Parameters, PolarMeasurement
 
 PATH = Path("field.jsonl")
 
@@ -200,15 +200,22 @@ def test_origin_of_the_layout_does_not_matter() -> None:
 
 
 def test_predictions_do_not_depend_on_the_held_out_measurements() -> None:
-    """Shifting a held-out measurement changes no prediction of its fold, including its own."""
-    origin_ns = START
-    observations, _ = build_observations(SCENE.parameters, drive(), origin_ns=origin_ns)
-    found = held_out_errors(observations, SCENE.parameters.pipeline)
+    """Shifting a held-out measurement changes no prediction of its fold, with a set-up that is refined, including its own."""
+    frame = np.array(SCENE.parameters.stations[1].T_station1_station)
+    frame[2, 3] += 0.02
+    second = replace(
+        SCENE.parameters.stations[1], T_station1_station=cast("Matrix4", tuple(map(tuple, frame.tolist())))
+    )
+    stations = (SCENE.parameters.stations[0], second, SCENE.parameters.stations[2])
+    wrong = replace(SCENE.parameters, stations=stations)
+    assert smooth_recording(recording_of(drive(), wrong), path=PATH).parameters.stations[1] != second
+    observations, _ = build_observations(wrong, drive(), origin_ns=START)
+    found = held_out_errors(observations, wrong)
     assert found["linear"].statistics.n == found["continuous"].statistics.n == 3 * 25
     assert found["continuous"].statistics.mean < 0.5 * found["linear"].statistics.mean
     points = observations.points_m.copy()
     points[np.flatnonzero(observations.prism == 0)[FOLDS]] += 0.02
-    moved = held_out_errors(replace(observations, points_m=points), SCENE.parameters.pipeline)
+    moved = held_out_errors(replace(observations, points_m=points), wrong)
     # It is the first of fold 0 of its prism, which leaves five out.
     assert moved["continuous"].error_m[0] > 0.015
     np.testing.assert_array_equal(moved["continuous"].error_m[1:5], found["continuous"].error_m[1:5])

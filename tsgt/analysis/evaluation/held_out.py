@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.evaluation.normalised_prediction import near_loss, normalised_prediction_errors
+from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.smoothing import estimate_motion_model
+from tsgt.geometry.calibration import Setup
 from tsgt.geometry.trajectory import fit_trajectory, scale_noise
 
 if TYPE_CHECKING:
@@ -23,9 +25,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.refinement import Refine
+    from tsgt.analysis.smoothing import MotionModel
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import Observations, Trajectory
-    from tsgt.model import PipelineParameters
+    from tsgt.model import Parameters
 
 FOLDS = 5
 
@@ -156,25 +160,26 @@ def trajectory_errors(trajectory: Trajectory, test: Observations) -> FloatArray:
 
 def held_out_errors(
     observations: Observations,
-    pipeline: PipelineParameters,
+    parameters: Parameters,
     *,
+    refine: Refine = "auto",
     on_progress: Callable[[float], None] | None = None,
 ) -> dict[Estimator, HeldOutErrors]:
-    """Cross-validate both estimators on observations in the order of time, with the stated noise.
+    """Cross-validate both estimators on observations in the order of time, with the stated noise and the recorded set-up.
 
-    The hyperparameters are estimated five times, each time without the test measurements of one number's folds of all
-    prisms, so that no prediction depends on the measurement that it is compared with; ``pipeline`` bounds them from below,
-    and replaces them if the measurements are too few. ``on_progress`` gets the completed fraction, 0 to 1. Raises
-    GeometryError if no trajectory fits the training measurements.
+    The hyperparameters are estimated and the set-up is refined five times, each time without the test measurements of one
+    number's folds of all prisms, so that no prediction depends on the measurement that it is compared with; the pipeline's
+    bound the hyperparameters from below, and replace them if the measurements are too few. ``linear`` has the recorded
+    set-up. ``on_progress`` gets the completed fraction, 0 to 1. Raises GeometryError if no trajectory fits the training
+    measurements.
     """
     report = on_progress or (lambda _: None)
     splits = folds(observations)
-    motions = []
+    models = []
     for number in range(FOLDS if splits else 0):
         report(number / (2 * FOLDS))
-        motions.append(
-            estimate_motion_model(observations.select(training_rows(observations, number)), pipeline)
-        )
+        training = observations.select(training_rows(observations, number))
+        models.append(_training_model(training, parameters, refine))
     done = 0
     normalised = []
     near = near_loss(observations.time_s, observations.station)
@@ -183,14 +188,14 @@ def held_out_errors(
         nonlocal done
         report(0.5 + 0.5 * done / len(splits))
         done += 1
-        motion = motions[fold.number]
+        setup, motion = models[fold.number]
         found = fit_trajectory(
-            observations.select(fold.training),
+            setup.applied(observations.select(fold.training)),
             prior=motion.prior,
-            occluded_prior=pipeline.motion,
+            occluded_prior=parameters.pipeline.motion,
             noise_scale=motion.noise_scales,
         )
-        test = observations.select(fold.test)
+        test = setup.applied_in_place(observations.select(fold.test))
         normalised.append(
             normalised_prediction_errors(
                 found.trajectory, scale_noise(test, motion.noise_scales), near[fold.test]
@@ -207,3 +212,20 @@ def held_out_errors(
         result["continuous"] = replace(result["continuous"], normalised=np.concatenate(normalised), rows=rows)
     report(1.0)
     return result
+
+
+def _training_model(
+    training: Observations, parameters: Parameters, refine: Refine
+) -> tuple[Setup, MotionModel]:
+    """Return the set-up and the hyperparameters from training measurements alone."""
+    setup = Setup.of(training)
+    motion = estimate_motion_model(training, parameters.pipeline)
+    if not motion.tuned:
+        return setup, motion
+    refined = refine_recorded_setup(parameters, training, motion.prior, motion.noise_scales, refine)
+    if refined is None or not refined.used:
+        return setup, motion
+    setup = refined.setup
+    return setup, estimate_motion_model(
+        setup.applied(training), parameters.pipeline, start=refined.motion_prior
+    )

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         StationaryStatistics,
     )
     from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.refinement import Refine
     from tsgt.analysis.report.motion import DistanceErrorSeries
     from tsgt.analysis.report.stations import StationRecord, StationStatistics
     from tsgt.analysis.smoothing import SmoothedRecording
@@ -166,6 +167,7 @@ def collect_findings(
     *,
     reference: Reference | None,
     with_held_out: bool,
+    refine: Refine = "auto",
     align: Align | None = None,
     stationary_ns: Sequence[tuple[int, int]] | None = None,
     on_progress: Callable[[float], None] | None = None,
@@ -173,7 +175,7 @@ def collect_findings(
     """Compute the content of a report.
 
     ``reference``: trajectory to compare poses with, unaligned and after ``align``; ``with_held_out``: cross-validate both
-    estimators; ``stationary_ns``: from another source than the measurements; ``on_progress`` gets the fraction, 0 to 1.
+    estimators; ``refine``: what of the set-up may be refined; ``stationary_ns``: from another source than the measurements; ``on_progress`` gets the fraction, 0 to 1.
     Raises RecordingError if there is no measurement at all, or the file cannot be read.
     """
     report = on_progress or (lambda _: None)
@@ -196,7 +198,9 @@ def collect_findings(
 
     continuous = attempt(
         "continuous",
-        lambda: smooth_recording(recording, path=path, on_progress=lambda share: report(fitted * share)),
+        lambda: smooth_recording(
+            recording, path=path, refine=refine, on_progress=lambda share: report(fitted * share)
+        ),
     )
     report(fitted)
     linear = attempt("linear", lambda: process(with_estimator(recording, "linear"), path=path))
@@ -214,7 +218,10 @@ def collect_findings(
         held_out = attempt(
             "held_out",
             lambda: held_out_errors(
-                observations, parameters.pipeline, on_progress=lambda s: report(fitted + 0.1 + 0.3 * s)
+                observations,
+                parameters,
+                refine=refine,
+                on_progress=lambda s: report(fitted + 0.1 + 0.3 * s),
             ),
         )
     report(0.9)

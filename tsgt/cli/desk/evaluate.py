@@ -42,6 +42,9 @@ from tsgt.cli.recordings import (
     pose_counts,
     pose_summary,
     prisms_option,
+    refine_option,
+    refinement_keys,
+    refinement_text,
 )
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.estimation import build_observations, build_tracks
@@ -59,6 +62,7 @@ if TYPE_CHECKING:
         PairDistances,
     )
     from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.refinement import Refine
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.cli.desk.reference import Comparison
     from tsgt.model import ReferencePoint
@@ -105,6 +109,7 @@ LISTED_OUTLIERS = 10
 )
 @frames_option
 @prisms_option
+@refine_option
 @keep_going_option
 @json_option
 def evaluate(
@@ -120,6 +125,7 @@ def evaluate(
     odometry: Path | None,
     frames: Path | None,
     prisms: Path | None,
+    refine: Refine,
     keep_going: bool,
     as_json: bool,
 ) -> None:
@@ -151,17 +157,18 @@ def evaluate(
             align=alignment,
             odometry=odometry,
             with_held_out=with_held_out,
+            refine=refine,
             as_json=as_json,
         )
         return
     parameters = loaded.parameters
     with progress("fitting", first=TUNING) as on_progress:
-        continuous = smooth_recording(loaded, path=recording, on_progress=on_progress)
+        continuous = smooth_recording(loaded, path=recording, refine=refine, on_progress=on_progress)
     poses = continuous.poses
     if parameters.pipeline.estimator != "continuous":
         poses = process(loaded, path=recording)
     found = inter_prism(parameters, build_tracks(parameters, loaded.measurements))
-    predicted = _held_out(loaded, continuous, recording) if with_held_out is not False else None
+    predicted = _held_out(loaded, continuous, recording, refine) if with_held_out is not False else None
     rejected = outliers(continuous.fit, continuous.sources)
     residuals = residual_statistics(continuous.fit, continuous.sources)
     diagnosis = _diagnosis(loaded, continuous, predicted, found)
@@ -187,6 +194,7 @@ def evaluate(
                 "inter_prism_static_mm": _figures(found.static),
                 **({} if diagnosis is None else {"diagnosis": diagnosis.numbers()}),
                 **({} if predicted is None else {"held_out_mm": _held_out_keys(predicted)}),
+                **refinement_keys(continuous),
                 **motion_keys(continuous),
                 "residuals": {
                     station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
@@ -216,6 +224,7 @@ def evaluate(
     if predicted is not None:
         click.echo("\nHeld-out prediction error (mm)")
         _print_held_out(predicted)
+    click.echo(f"\n{refinement_text(continuous)}")
     click.echo(f"\n{motion_text(continuous, parameters.pipeline.motion)}")
     click.echo("\nNormalised residuals of the continuous trajectory")
     rows = [
@@ -245,14 +254,16 @@ def _diagnosis(
         return None
 
 
-def _held_out(loaded: Recording, continuous: SmoothedRecording, path: Path) -> dict[Estimator, HeldOutErrors]:
+def _held_out(
+    loaded: Recording, continuous: SmoothedRecording, path: Path, refine: Refine
+) -> dict[Estimator, HeldOutErrors]:
     # Not the observations of the fit: their noise scale was estimated from all measurements, held-out ones included.
     observations, _ = build_observations(
         loaded.parameters, continuous.sources, origin_ns=continuous.origin_ns
     )
     try:
         with progress("predicting held-out measurements") as on_progress:
-            return held_out_errors(observations, loaded.parameters.pipeline, on_progress=on_progress)
+            return held_out_errors(observations, loaded.parameters, refine=refine, on_progress=on_progress)
     except GeometryError as error:
         raise RecordingError(str(error), path=path) from error
 

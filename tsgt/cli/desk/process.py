@@ -32,6 +32,9 @@ from tsgt.cli.recordings import (
     pose_counts,
     pose_summary,
     prisms_option,
+    refine_option,
+    refinement_keys,
+    refinement_text,
     write_lines,
     write_recording,
 )
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.refinement import Refine
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters, ReferencePoint
@@ -71,6 +75,7 @@ FORMATS = {".tum": "tum", ".jsonl": "jsonl", ".json": "jsonl", ".csv": "csv"}
     required=True,
     help="File to write: .tum, .jsonl or .csv; replaced if it exists.",
 )
+@refine_option
 @keep_going_option
 @json_option
 def process(
@@ -83,6 +88,7 @@ def process(
     point: ReferencePoint | None,
     format_name: str | None,
     output: Path,
+    refine: Refine,
     keep_going: bool,
     as_json: bool,
 ) -> None:
@@ -105,7 +111,7 @@ def process(
         prisms=prisms,
         point=point,
     )
-    poses, parameters, continuous = _processed(loaded, recording)
+    poses, parameters, continuous = _processed(loaded, recording, refine)
     with progress("writing poses") as on_progress:
         if format_name == "tum":
             write_lines(output, tum_lines(valid_rows(poses), poses.reference_point))
@@ -123,7 +129,11 @@ def process(
         "seconds": time.perf_counter() - started_s,
         "duration_s": duration_s(poses),
         "measurements": len(loaded.measurements),
-        **({} if continuous is None else {**motion_keys(continuous), "rest_s": continuous.fit.rest_s}),
+        **(
+            {}
+            if continuous is None
+            else {**motion_keys(continuous), **refinement_keys(continuous), "rest_s": continuous.fit.rest_s}
+        ),
     }
     if as_json:
         print_json(result)
@@ -131,18 +141,21 @@ def process(
     at = point_label(poses.reference_point)
     click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements, at {at}")
     if continuous is not None:
+        click.echo(refinement_text(continuous))
         click.echo(motion_text(continuous, loaded.parameters.pipeline.motion))
         click.echo(f"At rest: {continuous.fit.rest_s:.1f} s in {len(continuous.fit.rest)} intervals")
 
 
-def _processed(loaded: Recording, path: Path) -> tuple[PoseBatch, Parameters, SmoothedRecording | None]:
+def _processed(
+    loaded: Recording, path: Path, refine: Refine
+) -> tuple[PoseBatch, Parameters, SmoothedRecording | None]:
     """Return the poses, the parameters that they were computed with, and the trajectory of ``continuous``."""
     parameters = loaded.parameters
     if parameters.pipeline.estimator == "linear":
         return process_recording(loaded, path=path), parameters, None
     with progress("fitting", first=TUNING) as on_progress:
-        found = smooth_recording(loaded, path=path, on_progress=on_progress)
+        found = smooth_recording(loaded, path=path, refine=refine, on_progress=on_progress)
     motion = found.motion
     pipeline = dataclasses.replace(parameters.pipeline, motion=motion.prior)
-    parameters = dataclasses.replace(parameters, pipeline=pipeline)
+    parameters = dataclasses.replace(found.parameters, pipeline=pipeline)
     return found.poses, with_noise_scales(parameters, motion.noise_scales, motion.noise_scale), found

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.diagnosis import Diagnosis
     from tsgt.analysis.evaluation import Align, InterPrismDistances, PoseErrorStatistics, Reference
     from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.refinement import Refine
     from tsgt.analysis.report.verdicts import Verdict
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.recording import Recording
@@ -99,6 +100,7 @@ def report_evaluation(
     align: Align | None = None,
     odometry: Path | None,
     with_held_out: bool | None,
+    refine: Refine,
     as_json: bool,
 ) -> None:
     """Evaluate a recording and write the report.
@@ -113,6 +115,8 @@ def report_evaluation(
         File that defines the stationary intervals; None: from the measurements.
     with_held_out
         Whether to compute the held-out prediction error; None: only for a short recording.
+    refine
+        What of the set-up may be refined.
     as_json
         Print the numbers instead of the verdicts.
     """
@@ -127,6 +131,7 @@ def report_evaluation(
             reference=reference,
             align=align,
             with_held_out=with_held_out,
+            refine=refine,
             stationary_ns=stationary_ns,
             on_progress=on_progress,
         )

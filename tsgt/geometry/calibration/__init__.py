@@ -5,9 +5,11 @@ prism positions with covariances, rejected points, and the directions that the d
 """
 
 from tsgt.geometry.calibration.frame_fit import FrameFit, PointName, PointPairs, PointSet, fit_frame
+from tsgt.geometry.calibration.hypotheses import Hypothesis, HypothesisKind
 from tsgt.geometry.calibration.motion import MotionCalibration, calibrate_motion
 from tsgt.geometry.calibration.motion_initialisation import frames_from_motion
 from tsgt.geometry.calibration.observability import UnobservableDirection, unobservable_directions
+from tsgt.geometry.calibration.refinement import HypothesisEvidence, RefinedSetup, refine_setup
 from tsgt.geometry.calibration.setup_parameters import Setup, SetupParameters
 from tsgt.geometry.calibration.setup_prior import SetupPrior, calibrated_covariance
 from tsgt.geometry.calibration.station_frames import (
@@ -60,12 +62,16 @@ __all__ = [
     "FrameCalibration",
     "FrameFit",
     "InstrumentError",
+    "Hypothesis",
+    "HypothesisEvidence",
+    "HypothesisKind",
     "MotionCalibration",
     "NetworkCalibration",
     "PointName",
     "PointPairs",
     "PointSet",
     "PrismCalibration",
+    "RefinedSetup",
     "Setup",
     "SetupParameters",
     "SetupPrior",
@@ -82,6 +88,7 @@ __all__ = [
     "frames_from_motion",
     "rejected_targets",
     "station_frames",
+    "refine_setup",
     "unobservable_directions",
     "unweighted_frames",
 ]

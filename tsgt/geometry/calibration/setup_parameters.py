@@ -53,17 +53,20 @@ class Setup:
 
     def applied(self, observations: Observations) -> Observations:
         """Return observations, which nothing of this set-up has corrected yet, with this set-up, in the order of time."""
-        time_s = observations.time_s - self.latencies_s[observations.station]
-        updated = replace(
+        updated = self.applied_in_place(observations)
+        return updated.select(np.argsort(updated.time_s, kind="stable"))
+
+    def applied_in_place(self, observations: Observations) -> Observations:
+        """Return the same in the given order, which may no longer be that of time."""
+        return replace(
             observations,
-            time_s=time_s,
-            points_m=self._corrected(observations),
+            time_s=observations.time_s - self.latencies_s[observations.station],
+            points_m=self._corrected_points(observations),
             frames=self.frames,
             layout=self.layout,
         )
-        return updated.select(np.argsort(time_s, kind="stable"))
 
-    def _corrected(self, observations: Observations) -> FloatArray:
+    def _corrected_points(self, observations: Observations) -> FloatArray:
         """(M, 3) measured points without instrument errors."""
         if not self.instrument.any():
             return observations.points_m

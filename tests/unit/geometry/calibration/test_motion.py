@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from harness.drive import LAYOUT, MOTION_PRIOR, drive, frames
 
 from tsgt.errors import GeometryError
-from tsgt.geometry import exp_so3, rotate
+from tsgt.geometry import exp_so3
 from tsgt.geometry.calibration import (
     Setup,
     SetupPrior,
@@ -19,66 +20,13 @@ from tsgt.geometry.calibration import (
 )
 from tsgt.geometry.calibration.setup_parameters import SetupParameters
 from tsgt.geometry.trajectory import Observations, initial_guess, knot_times, linearise
-from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
-from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.geometry.calibration import MotionCalibration
 
-LAYOUT = np.array([[-0.4559, -0.1759, 1.1167], [0.4844, -0.1759, 1.4167], [-0.0285, 0.3519, 1.0667]])
-PRIOR = MotionPrior(
-    acceleration_sigma_mps2=(0.4, 0.4, 0.1), angular_acceleration_sigma_radps2=(0.05, 0.05, 0.15)
-)
 REFINE = SetupPrior(translation_sigma_m=0.05, rotation_sigma_rad=0.005, latency_sigma_s=0.1)
 FROM_NOTHING = SetupPrior(translation_sigma_m=10.0, rotation_sigma_rad=0.2, latency_sigma_s=1.0)
-
-
-def frames() -> FloatArray:
-    """Three stations near each other."""
-    found = np.tile(np.eye(4), (3, 1, 1))
-    for station, (heading, place) in enumerate(
-        [(0.0, (0, 0, 0)), (0.6, (2.0, -1.5, 0.1)), (-1.2, (-1.5, 2.5, -0.2))]
-    ):
-        found[station, :3, :3] = exp_so3(np.array([0.0, 0.0, heading]))
-        found[station, :3, 3] = place
-    return found
-
-
-def drive(
-    duration_s: float = 120.0, *, seed: int = 0, straight: bool = False, still: bool = False
-) -> Observations:
-    """Tracks of a robot on a winding path over uneven ground, 40 m away, with the stated noise."""
-    rng = np.random.default_rng(seed)
-    time_s = np.concatenate([np.arange(0.13 * station, duration_s, 0.4) for station in range(3)])
-    station = np.concatenate([np.full(len(np.arange(0.13 * s, duration_s, 0.4)), s) for s in range(3)])
-    order = np.argsort(time_s, kind="stable")
-    time_s, station = time_s[order], station[order]
-    if still:
-        position, turn = np.tile([40.0, 10.0, -1.0], (len(time_s), 1)), np.zeros((len(time_s), 3))
-    elif straight:
-        position = np.stack(
-            [20 + 0.5 * time_s, np.full_like(time_s, 10.0), np.full_like(time_s, -1.0)], axis=1
-        )
-        turn = np.zeros((len(time_s), 3))
-    else:
-        around = 0.1 * time_s
-        position = np.stack(
-            [40 + 12 * np.sin(around), 10 + 8 * np.sin(2 * around), -1 + 0.5 * np.sin(3.1 * around)], axis=1
-        )
-        heading = np.unwrap(np.arctan2(16 * np.cos(2 * around), 12 * np.cos(around)))
-        turn = np.stack([0.05 * np.sin(5 * around), 0.05 * np.cos(4 * around), heading], axis=1)
-    rotation = exp_so3(np.stack([0 * time_s, 0 * time_s, turn[:, 2]], axis=1)) @ exp_so3(turn * [1, 1, 0])
-    seen = frames()[station]
-    world = position + rotate(rotation, LAYOUT[station])
-    points = rotate(np.swapaxes(seen[:, :3, :3], 1, 2), world - seen[:, :3, 3])
-    axes, _ = line_of_sight_axes(points)
-    sigmas = np.tile([0.002, 0.001, 0.001], (len(points), 1))
-    points = points + rotate(np.swapaxes(axes, 1, 2), rng.normal(size=points.shape) * sigmas)
-    everything = np.ones(len(points), np.bool_)
-    return Observations(
-        time_s, np.zeros(len(points)), points, sigmas, everything, station, station, frames(), LAYOUT
-    )
 
 
 def with_errors(observations: Observations) -> Observations:
@@ -114,7 +62,7 @@ def calibration_error(
     found_from: Observations, known: SetupPrior, start: Setup | None = None
 ) -> tuple[float, int, FloatArray]:
     """NEES of a result, its degrees of freedom, and the error at the robot in m."""
-    found = calibrate_motion(found_from, known, start=start, prior=PRIOR, noise_scale=1.0)
+    found = calibrate_motion(found_from, known, start=start, prior=MOTION_PRIOR, noise_scale=1.0)
     missed, _ = found.setup.corrections(TRUE, found.parameters.pivot)
     return *normalised_error(found), missed
 
@@ -142,7 +90,7 @@ def test_wander_is_estimated_and_included() -> None:
         observations = with_wander(
             with_errors(drive(160.0, seed=seed)), sigma_s=3e-3, piece_s=40.0, seed=seed
         )
-        found = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
+        found = calibrate_motion(observations, REFINE, prior=MOTION_PRIOR, noise_scale=1.0)
         distances.append(normalised_error(found)[0])
         wander_s.append(found.wander_s)
     assert 1.5e-3 < np.mean(wander_s) < 5e-3
@@ -151,14 +99,14 @@ def test_wander_is_estimated_and_included() -> None:
 
 def test_no_wander_in_white_noise() -> None:
     """Less than half a millisecond is found in white noise."""
-    assert calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0).wander_s < 5e-4
+    assert calibrate_motion(drive(), REFINE, prior=MOTION_PRIOR, noise_scale=1.0).wander_s < 5e-4
 
 
 def test_gap_of_all_stations() -> None:
     """Half a minute without measurements splits the segments; both sides agree."""
     observations = with_errors(drive())
     observations_with_gap = observations.select((observations.time_s < 20.0) | (observations.time_s > 52.0))
-    found = calibrate_motion(observations_with_gap, REFINE, prior=PRIOR, noise_scale=1.0)
+    found = calibrate_motion(observations_with_gap, REFINE, prior=MOTION_PRIOR, noise_scale=1.0)
     assert found.measurements == len(observations_with_gap)
     assert found.outliers < 5
     assert found.birge_ratio < 1.5
@@ -167,8 +115,10 @@ def test_gap_of_all_stations() -> None:
 def test_levelled_stations_have_four_degrees_of_freedom() -> None:
     """Tilts are unchanged, and the result is as certain or better."""
     observations = drive()
-    free = calibrate_motion(observations, REFINE, prior=PRIOR, noise_scale=1.0)
-    level = calibrate_motion(observations, replace(REFINE, levelled=True), prior=PRIOR, noise_scale=1.0)
+    free = calibrate_motion(observations, REFINE, prior=MOTION_PRIOR, noise_scale=1.0)
+    level = calibrate_motion(
+        observations, replace(REFINE, levelled=True), prior=MOTION_PRIOR, noise_scale=1.0
+    )
     assert np.count_nonzero(level.prior_sigmas) == 10
     assert np.allclose(level.setup.frames[:, 2, :3], [0.0, 0.0, 1.0], atol=1e-12)
     at = np.concatenate([level.parameters.translations.ravel(), level.parameters.rotations[:, -1]])
@@ -194,7 +144,10 @@ def test_prism_layout_is_calibrated() -> None:
     shifted = LAYOUT.copy()
     shifted[2] += [0.004, 0.0, 0.0]
     found = calibrate_motion(
-        replace(observations, layout=shifted), SetupPrior(prism_sigma_m=0.01), prior=PRIOR, noise_scale=1.0
+        replace(observations, layout=shifted),
+        SetupPrior(prism_sigma_m=0.01),
+        prior=MOTION_PRIOR,
+        noise_scale=1.0,
     )
     apart = np.linalg.norm(found.setup.layout - np.roll(found.setup.layout, 1, axis=0), axis=1)
     assert apart == pytest.approx(np.linalg.norm(LAYOUT - np.roll(LAYOUT, 1, axis=0), axis=1), abs=5e-4)
@@ -229,26 +182,28 @@ def test_local_coordinates_invert_a_step() -> None:
 
 def test_straight_drive_is_unobservable() -> None:
     """Driving straight on level ground leaves rotations about the path unobservable; a winding path leaves none."""
-    straight = calibrate_motion(drive(30.0, straight=True), REFINE, prior=PRIOR, noise_scale=1.0)
+    straight = calibrate_motion(drive(30.0, straight=True), REFINE, prior=MOTION_PRIOR, noise_scale=1.0)
     sentences = [direction.description for direction in unobservable_directions(straight)]
     assert any(
         "station 2 turns by" in description and "mrad about bearing" in description
         for description in sentences
     )
-    assert unobservable_directions(calibrate_motion(drive(), REFINE, prior=PRIOR, noise_scale=1.0)) == []
+    assert (
+        unobservable_directions(calibrate_motion(drive(), REFINE, prior=MOTION_PRIOR, noise_scale=1.0)) == []
+    )
 
 
 def test_station_1_is_needed() -> None:
     """Frames and latencies are relative to station 1."""
     observations = drive(20.0)
     with pytest.raises(GeometryError, match="station 1 has measured nothing"):
-        calibrate_motion(observations.select(observations.station > 0), REFINE, prior=PRIOR)
+        calibrate_motion(observations.select(observations.station > 0), REFINE, prior=MOTION_PRIOR)
 
 
 def test_nothing_to_estimate_is_rejected() -> None:
     """With everything fixed there is nothing to estimate."""
     with pytest.raises(GeometryError, match="nothing to estimate"):
-        calibrate_motion(drive(20.0), SetupPrior(), prior=PRIOR)
+        calibrate_motion(drive(20.0), SetupPrior(), prior=MOTION_PRIOR)
 
 
 def test_stationary_robot_is_rejected() -> None:

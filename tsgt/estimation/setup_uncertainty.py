@@ -1,0 +1,84 @@
+"""The set-up of the parameters as the estimators' vector of parameters, with its covariance, and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from tsgt.model import SetupCovariance
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.calibration import Setup, SetupParameters
+    from tsgt.model import Matrix4, Parameters, StationParameters, Vector3
+
+
+def parameter_names(layout: SetupParameters, parameters: Parameters) -> list[str]:
+    """Return the components of a set-up covariance that the vector of parameters stands for."""
+    return layout.names([s.station for s in parameters.stations], [p.prism for p in parameters.prisms])
+
+
+def stated_covariance(layout: SetupParameters, parameters: Parameters) -> FloatArray | None:
+    """Return the (G, G) covariance of the set-up as the parameters state it; None: unknown. What they omit is exact."""
+    known = parameters.setup_covariance
+    if known is None:
+        return None
+    rows = {name: row for row, name in enumerate(known.components)}
+    names = parameter_names(layout, parameters)
+    ours = [i for i, name in enumerate(names) if name in rows]
+    theirs = [rows[names[i]] for i in ours]
+    covariance = np.zeros((layout.count, layout.count))
+    covariance[np.ix_(ours, ours)] = np.array(known.matrix)[np.ix_(theirs, theirs)]
+    to_pivot = layout.from_station_origins()
+    result: FloatArray = to_pivot @ covariance @ to_pivot.T
+    return result
+
+
+def with_setup(
+    parameters: Parameters, layout: SetupParameters, setup: Setup, covariance: FloatArray
+) -> Parameters:
+    """Return the parameters with a set-up that was estimated about theirs, and its covariance, (G, G)."""
+    displacement_m = setup.layout - layout.reference.layout
+    stations = tuple(_with_setup(station, setup, row) for row, station in enumerate(parameters.stations))
+    prisms = tuple(
+        replace(prism, position_m=cast("Vector3", tuple((prism.position_m + displacement_m[row]).tolist())))
+        for row, prism in enumerate(parameters.prisms)
+    )
+    to_origins = np.linalg.inv(layout.from_station_origins())
+    at_origins = to_origins @ covariance @ to_origins.T
+    free = np.flatnonzero(np.diag(at_origins) > 0)
+    matrix = 0.5 * (at_origins + at_origins.T)[np.ix_(free, free)]
+    names = parameter_names(layout, parameters)
+    return replace(
+        parameters,
+        stations=stations,
+        prisms=prisms,
+        setup_covariance=SetupCovariance(
+            components=tuple(names[i] for i in free), matrix=tuple(map(tuple, matrix.tolist()))
+        ),
+    )
+
+
+def _with_setup(station: StationParameters, setup: Setup, row: int) -> StationParameters:
+    index, collimation, constant_m, scale = map(float, setup.instrument[row])
+    frame = setup.frames[row]
+    changed = not np.array_equal(frame, np.array(station.T_station1_station))
+    return replace(
+        station,
+        T_station1_station=_matrix(frame) if changed else station.T_station1_station,
+        latency_ns=station.latency_ns + round(1e9 * float(setup.latencies_s[row])),
+        vertical_index_rad=station.vertical_index_rad + index,
+        collimation_rad=station.collimation_rad + collimation,
+        prism_constant_m=station.prism_constant_m * (1.0 + scale) + constant_m,
+        atmospheric_ppm=1e6 * ((1.0 + 1e-6 * station.atmospheric_ppm) * (1.0 + scale) - 1.0)
+        if scale
+        else station.atmospheric_ppm,
+    )
+
+
+def _matrix(frame: FloatArray) -> Matrix4:
+    # Products of rotations drift from orthonormality by rounding only.
+    a, b, c, d = (tuple(map(float, line)) for line in frame)
+    return cast("Matrix4", (a, b, c, d))

@@ -22,6 +22,7 @@ from tsgt.estimation import (
     build_observations,
     measured_at_ns,
     noise_scales,
+    setup_jacobian,
     usable,
     with_setup,
 )
@@ -106,6 +107,7 @@ def smooth_recording(
             prior=motion.prior,
             occluded_prior=parameters.pipeline.motion,
             noise_scale=motion.noise_scales,
+            setup_jacobian=setup_jacobian(parameters),
             on_progress=on_progress,
         )
     except GeometryError as error:
@@ -174,6 +176,8 @@ def _poses(
     chunks, poses = [], ContinuousPoseOutput(parameters)
     for start in range(0, max(len(epochs_ns), 1), _EPOCHS_PER_CHUNK):
         some_ns = epochs_ns[start : start + _EPOCHS_PER_CHUNK]
-        states, covariance = found.trajectory.at((some_ns - origin_ns) / 1e9, dim=_POSE_DIM)
-        chunks.append(poses.smoothed(some_ns, seen, states, covariance))
+        time_s = (some_ns - origin_ns) / 1e9
+        states, covariance = found.trajectory.at(time_s, dim=_POSE_DIM)
+        common = found.trajectory.common_at(time_s, dim=_POSE_DIM)
+        chunks.append(poses.smoothed(some_ns, seen, states, covariance, common=common))
     return PoseBatch.concatenated(chunks)

@@ -174,6 +174,7 @@ def refinement_keys(found: SmoothedRecording) -> dict[str, Any]:
     return {
         "refinement": {
             "used": refined.used,
+            "log_bayes_factor": refined.log_bayes_factor,
             "p_value": refined.p_value,
             "birge_ratio": refined.birge_ratio,
             "wander_ms": 1e3 * refined.wander_s,

@@ -25,7 +25,13 @@ from tsgt.estimation.reference_point import (
     transform_between,
     transform_of,
 )
-from tsgt.estimation.setup_uncertainty import parameter_names, stated_covariance, with_setup
+from tsgt.estimation.setup_uncertainty import (
+    parameter_names,
+    setup_jacobian,
+    stated_covariance,
+    uncertain_setup,
+    with_setup,
+)
 from tsgt.estimation.tracks import (
     MAX_DISTANCE_M,
     Track,
@@ -61,10 +67,12 @@ __all__ = [
     "poses_at",
     "records_at",
     "reference_point_text",
+    "setup_jacobian",
     "sigma_limits_of",
     "stated_covariance",
     "transform_between",
     "transform_of",
+    "uncertain_setup",
     "usable",
     "with_noise_scales",
     "with_setup",

@@ -19,6 +19,7 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations
 from tsgt.estimation.pose_batch import Kind, PoseBatch
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
+from tsgt.estimation.setup_uncertainty import setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states, scale_noise
@@ -26,6 +27,7 @@ from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states, scale
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import States
     from tsgt.model import Measurement, Parameters
 
@@ -51,7 +53,7 @@ class ContinuousEstimator:
         self._stations = {station.station: station for station in parameters.stations}
         self._noise_scales = noise_scales(parameters)
         self._poses = ContinuousPoseOutput(parameters)
-        self._window = FixedLagSmoother(self._limits.motion)
+        self._window = FixedLagSmoother(self._limits.motion, setup_jacobian(parameters))
         self._pending: list[Measurement] = []
         none = np.empty(0, np.int64)
         self._unusable: list[list[int]] = [[] for _ in self._columns]
@@ -154,12 +156,20 @@ class ContinuousEstimator:
         converged = np.full(len(time_s), self._window.converged and not self._window.ambiguous)
         ambiguous = self._window.recently_ambiguous_at(time_s)
         found = [self._window.predict(each_s, dim=_POSE_DIM) for each_s in time_s.tolist()]
+        added = [self._window.common_at(each_s, dim=_POSE_DIM) for each_s in time_s.tolist()]
+        common = [each for each in added if each is not None]
         states, covariance = found[0]
         if len(found) > 1:
             states = concatenate_states([state for state, _ in found])
             covariance = np.concatenate([each for _, each in found])
         return self._poses.predicted(
-            epochs_ns, self._history, states, covariance, converged=converged, ambiguous=ambiguous
+            epochs_ns,
+            self._history,
+            states,
+            covariance,
+            common=np.concatenate(common) if common else None,
+            converged=converged,
+            ambiguous=ambiguous,
         )
 
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
@@ -169,9 +179,12 @@ class ContinuousEstimator:
             return self._none
         states: States | None = None
         covariance = _NONE
+        common: FloatArray | None = None
         time_s = (stamp_ns - self._origin_ns) / 1e9
         if self._window.initialised:
-            states, covariance = self._window.trajectory().at(time_s, dim=_POSE_DIM)
+            trajectory = self._window.trajectory()
+            states, covariance = trajectory.at(time_s, dim=_POSE_DIM)
+            common = trajectory.common_at(time_s, dim=_POSE_DIM)
         reliable = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)
         reliable &= ~self._window.ambiguous_at(time_s)
         poses = self._poses.smoothed(
@@ -179,6 +192,7 @@ class ContinuousEstimator:
             self._history,
             states,
             covariance,
+            common=common,
             converged=reliable & self._window.converged,
             ambiguous=self._window.recently_ambiguous_at(time_s),
         )

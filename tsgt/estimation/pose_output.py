@@ -86,6 +86,7 @@ class ContinuousPoseOutput:
         states: States | None,
         covariance: NDArray[np.float64],
         *,
+        common: NDArray[np.float64] | None = None,
         converged: NDArray[np.bool_] | None = None,
         ambiguous: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
@@ -99,7 +100,9 @@ class ContinuousPoseOutput:
                     batch.prism_residual_m[row, column],
                     batch.prism_reason[row, column],
                 ) = self._latest(history.by_prism[column], home_station, stamp_ns)
-        return self._with_poses(batch, states, covariance, converged=converged, ambiguous=ambiguous)
+        return self._with_poses(
+            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous
+        )
 
     def smoothed(
         self,
@@ -108,6 +111,7 @@ class ContinuousPoseOutput:
         states: States | None,
         covariance: NDArray[np.float64],
         *,
+        common: NDArray[np.float64] | None = None,
         converged: NDArray[np.bool_] | None = None,
         ambiguous: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
@@ -124,6 +128,8 @@ class ContinuousPoseOutput:
         states, covariance
             The trajectory of the prisms' centroid at the epochs, and the covariance of its position and rotation
             errors, (N, 6, 6) or larger; None without a trajectory.
+        common
+            (N, 6, 6) what the set-up's uncertainty adds to that covariance; None: unknown.
         converged
             (N,) whether the trajectory is reliable there; no other pose is valid. Default: everywhere.
         ambiguous
@@ -132,7 +138,9 @@ class ContinuousPoseOutput:
         batch = PoseBatch.blank(stamp_ns, self._prisms, Kind.SMOOTHED)
         for column in range(len(self._prisms)):
             self._describe(batch, column, history)
-        return self._with_poses(batch, states, covariance, converged=converged, ambiguous=ambiguous)
+        return self._with_poses(
+            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous
+        )
 
     def _latest(
         self, prism: PrismHistory, home_station: int, epoch_ns: int
@@ -188,6 +196,7 @@ class ContinuousPoseOutput:
         states: States | None,
         covariance: NDArray[np.float64],
         *,
+        common: NDArray[np.float64] | None = None,
         converged: NDArray[np.bool_] | None = None,
         ambiguous: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
@@ -197,6 +206,11 @@ class ContinuousPoseOutput:
             batch.reason[:] = np.where(missing, missing, Reason.DEGENERATE_GEOMETRY)
             return poses_at(batch, self._reference_point)
         limits, rotation = self._limits, states.rotation
+        if common is not None:
+            covariance = covariance[:, :6, :6] + common
+            batch.covariance_common[:] = ros_covariance(
+                rotation, state_at_point(states, common, self._to_origin_m)[1]
+            )
         states, covariance = state_at_point(states, covariance, self._to_origin_m)
         covariance, sigma_rad = with_second_order_terms(rotation, covariance)
         unknown = ~(sigma_rad < MAX_ROTATION_SIGMA_RAD)
@@ -210,7 +224,12 @@ class ContinuousPoseOutput:
         count = known.sum(axis=1)
         batch.residual_m[:] = np.where(count, np.sqrt(squares.sum(axis=1) / np.maximum(count, 1)), np.nan)
         if unknown.any():
-            for numbers in (batch.position_m, batch.orientation_xyzw, batch.covariance):
+            for numbers in (
+                batch.position_m,
+                batch.orientation_xyzw,
+                batch.covariance,
+                batch.covariance_common,
+            ):
                 numbers[unknown] = np.nan
             for numbers in (batch.velocity_mps, batch.angular_velocity_radps, batch.residual_m):
                 numbers[unknown] = np.nan

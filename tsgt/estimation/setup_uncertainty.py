@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from tsgt.geometry.calibration import INSTRUMENT_ERRORS, Setup, SetupParameters, factor_of
 from tsgt.model import SetupCovariance
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import Setup, SetupParameters
+    from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, SetupJacobian
     from tsgt.model import Matrix4, Parameters, StationParameters, Vector3
 
 
@@ -34,6 +35,37 @@ def stated_covariance(layout: SetupParameters, parameters: Parameters) -> FloatA
     to_pivot = layout.from_station_origins()
     result: FloatArray = to_pivot @ covariance @ to_pivot.T
     return result
+
+
+def setup_jacobian(parameters: Parameters) -> SetupJacobian | None:
+    """Return how the residuals of observations with these parameters depend on the set-up's errors; None: unknown.
+
+    The columns are those of a factor of the set-up's covariance.
+    """
+    layout = uncertain_setup(parameters)
+    covariance = stated_covariance(layout, parameters)
+    if covariance is None:
+        return None
+    factor = factor_of(covariance)
+
+    def jacobian(observations: Observations, linearised: LinearisedMeasurements) -> FloatArray:
+        by_setup: FloatArray = layout.jacobian(observations, linearised, layout.reference) @ factor
+        return by_setup
+
+    return jacobian
+
+
+def uncertain_setup(parameters: Parameters) -> SetupParameters:
+    """Return the vector of all parameters of the set-up; stations rotate about the origin of frame ``station1``."""
+    frames = np.array([*(s.T_station1_station for s in parameters.stations), np.eye(4)])
+    positions_m = np.array([p.position_m for p in parameters.prisms])
+    setup = Setup(
+        frames=frames,
+        latencies_s=np.zeros(len(frames)),
+        instrument=np.zeros((len(frames), len(INSTRUMENT_ERRORS))),
+        layout=positions_m - positions_m.mean(axis=0),
+    )
+    return SetupParameters.of(setup, np.zeros(3), range(len(parameters.stations)))
 
 
 def with_setup(

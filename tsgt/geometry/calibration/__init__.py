@@ -10,8 +10,8 @@ from tsgt.geometry.calibration.motion import MotionCalibration, calibrate_motion
 from tsgt.geometry.calibration.motion_initialisation import frames_from_motion
 from tsgt.geometry.calibration.observability import UnobservableDirection, unobservable_directions
 from tsgt.geometry.calibration.refinement import HypothesisEvidence, RefinedSetup, refine_setup
-from tsgt.geometry.calibration.setup_parameters import Setup, SetupParameters
-from tsgt.geometry.calibration.setup_prior import SetupPrior, calibrated_covariance
+from tsgt.geometry.calibration.setup_parameters import INSTRUMENT_ERRORS, Setup, SetupParameters
+from tsgt.geometry.calibration.setup_prior import SetupPrior, calibrated_covariance, factor_of
 from tsgt.geometry.calibration.station_frames import (
     CONSISTENCY,
     Check,
@@ -51,6 +51,7 @@ __all__ = [
     "DATA_SHEET_SIGMA",
     "ERRORS",
     "FALSE_ALARM_RATE",
+    "INSTRUMENT_ERRORS",
     "MIN_POINTS",
     "STATION_LIMITS",
     "Cause",
@@ -84,6 +85,7 @@ __all__ = [
     "calibrate_prisms",
     "calibrated_covariance",
     "checks",
+    "factor_of",
     "fit_frame",
     "frames_from_motion",
     "rejected_targets",

@@ -17,7 +17,7 @@ from tsgt.geometry.calibration.timestamp_drift import SegmentInformation
 from tsgt.geometry.rigid import matvec
 from tsgt.geometry.trajectory import (
     MIN_KNOT_SPACING_S,
-    STATE_DIM,
+    coupling,
     initial_guess,
     knot_times,
     scale_noise,
@@ -133,12 +133,11 @@ def normal_equations(
 
     ``by_setup``: (M, 3, G) Jacobian of the residuals at the solution.
     """
-    linearised = solution.linearised
+    linearised, knots = solution.linearised, solution.knots
+    cross = coupling(observations, linearised, solution.weights, solution.knot_index, len(knots), by_setup)
     whitening = np.linalg.inv(np.linalg.cholesky(linearised.covariance(observations)))
     whitening *= np.sqrt(solution.weights)[:, None, None]
     residuals = matvec(whitening, linearised.residuals_m)
-    by_state, by_setup = whitening @ linearised.jacobian, whitening @ by_setup
-    cross = np.zeros((len(solution.knots), STATE_DIM, by_setup.shape[2]))
-    np.add.at(cross, solution.knot_index, np.swapaxes(by_state, 1, 2) @ by_setup)
+    by_setup = whitening @ by_setup
     flat = by_setup.reshape(-1, by_setup.shape[2])
     return flat.T @ flat, cross, flat.T @ residuals.ravel()

@@ -204,8 +204,11 @@ def _fit(
 
 def _without_rounding(segment: SegmentInformation) -> SegmentInformation:
     """Remove negative information, which rounding leaves in directions that the trajectory absorbs."""
-    scale = np.sqrt(np.maximum(np.diag(segment.information), 1e-300))
+    variances = np.diag(segment.information)
+    informed = variances > 0
+    scale = np.sqrt(np.where(informed, variances, 1.0))
     normalised = 0.5 * (segment.information + segment.information.T) / np.outer(scale, scale)
+    normalised[~informed] = normalised[:, ~informed] = 0.0
     values, vectors = np.linalg.eigh(normalised)
     kept = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return SegmentInformation(kept @ kept.T, segment.gradient)

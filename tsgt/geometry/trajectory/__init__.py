@@ -25,6 +25,7 @@ from tsgt.geometry.trajectory.noise_scales import overall_scale, scale_noise
 from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
 from tsgt.geometry.trajectory.rest import RestInterval, in_rest
 from tsgt.geometry.trajectory.rest_detection import Series, find_rest, find_rest_in_series
+from tsgt.geometry.trajectory.sensitivity import SetupJacobian, coupling
 from tsgt.geometry.trajectory.states import STATE_DIM, States, concatenate_states
 
 __all__ = [
@@ -36,11 +37,13 @@ __all__ = [
     "Observations",
     "RestInterval",
     "Series",
+    "SetupJacobian",
     "Solution",
     "States",
     "Trajectory",
     "TrajectoryFit",
     "concatenate_states",
+    "coupling",
     "find_rest",
     "find_rest_in_series",
     "fit_trajectory",

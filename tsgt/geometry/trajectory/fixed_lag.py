@@ -37,12 +37,14 @@ from tsgt.geometry.trajectory.measurement_factors import Observations
 from tsgt.geometry.trajectory.prediction_errors import PredictionErrorMonitor
 from tsgt.geometry.trajectory.propagation import Propagator, acceleration_response
 from tsgt.geometry.trajectory.query import Trajectory
+from tsgt.geometry.trajectory.sensitivity import WindowSensitivity, common_covariance
 from tsgt.geometry.trajectory.states import STATE_DIM, ProcessFactors, States, concatenate_states
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory.sensitivity import SetupJacobian
     from tsgt.model import MotionPrior
 
 CONVERGED_SIGMA_RAD = 0.1  # Below, an initialised trajectory is tracked
@@ -92,8 +94,9 @@ class FixedLagSmoother:
     a trajectory.
     """
 
-    def __init__(self, prior: MotionPrior) -> None:
+    def __init__(self, prior: MotionPrior, setup_jacobian: SetupJacobian | None = None) -> None:
         self._prior = prior
+        self._common = None if setup_jacobian is None else WindowSensitivity(setup_jacobian)
         self._horizon_s = -np.inf
         self._knots: States | None = None
         self._process: ProcessFactors | None = None
@@ -210,6 +213,11 @@ class FixedLagSmoother:
         factor = factorise(system.diagonal, system.off_diagonal)
         root = factor.last_block()
         mean = factor.solve(-system.gradient)[first]
+        if self._common is not None:
+            past = observations.select(is_past)
+            self._common.marginalise(
+                past, system.linearised, system.weights, knot_index[is_past], anchor, factor
+            )
         self._anchor = AnchorPrior(knots.select(slice(first, first + 1)), root @ root.T, mean)
         self._knots, self._process = knots.select(slice(first, None)), process.select(slice(first, None))
         self._horizon_s = float(self._knots.time_s[0])
@@ -240,8 +248,28 @@ class FixedLagSmoother:
         assert self._solved is not None  # noqa: S101 (only called while initialised)
         if self._trajectory is None:
             knots, factor = self._solved
-            self._trajectory = Trajectory(knots, self._prior, *factor.marginals())
+            self._trajectory = Trajectory(
+                knots,
+                self._prior,
+                *factor.marginals(),
+                common=None
+                if self._common is None
+                else common_covariance(self._common.of_window(knots, factor)),
+            )
         return self._trajectory
+
+    def common_at(self, time_s: float, *, dim: int = STATE_DIM) -> FloatArray | None:
+        """Return the (1, dim, dim) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""
+        if self._common is None:
+            return None
+        assert self._solved is not None  # noqa: S101 (only called while initialised)
+        assert self._propagator is not None  # noqa: S101 (only called while initialised)
+        if time_s < self._propagator.time_s:
+            return self.trajectory().common_at(np.array([time_s]), dim=dim)
+        newest = self._common.of_window(*self._solved)[-1]
+        displacement = self._propagator.by_start(time_s)[:dim] @ newest
+        covariance: FloatArray = (displacement @ displacement.T)[None]
+        return covariance
 
     def _select(self, rows: NDArray[np.bool_]) -> None:
         assert self.observations is not None  # noqa: S101 (only called with some)
@@ -257,6 +285,8 @@ class FixedLagSmoother:
             raise GeometryError("an initialisation needs two measurements of each of three prisms")
         guess = initial_guess(observations, knot_times(observations.time_s))
         self._anchor = diffuse_prior(guess.select(slice(0, 1)), self._prior)
+        if self._common is not None:
+            self._common.reset()
         outliers = self._solve(guess, MAX_INITIAL_ITERATIONS)
         if self._converged:
             assert self._knots is not None  # noqa: S101 (converged)
@@ -320,6 +350,10 @@ class FixedLagSmoother:
         """Make a solution the trajectory; return which measurements are outliers."""
         self._knots, self._process, self._solved, self._trajectory = knots, process, (knots, factor), None
         self.residuals_m = found.linearised.residuals_m
+        if self._common is not None:
+            assert self.observations is not None  # noqa: S101 (they were solved)
+            assert self._anchor is not None  # noqa: S101 (it was solved with)
+            self._common.record(self.observations, found.linearised, found.weights, self._anchor)
         inverse = np.linalg.inv(factor.last_block())
         covariance = inverse.T @ inverse
         self._propagator = Propagator(

@@ -48,6 +48,24 @@ class Propagator:
 
     def at(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """State at a time not before the start, and the (1, dim, dim) covariance of its leading error components."""
+        states, by_start, by_noise = self._propagated(time_s)
+        by_start, by_noise = by_start[:dim], by_noise[:dim]
+        noise = np.zeros((STATE_DIM, STATE_DIM))
+        # Linear and angular noise, each for three axes.
+        by_axis = (
+            np.repeat(_process_noise(time_s - self.time_s, self._times_s), 3, axis=0)
+            * self._variances[:, None, None]
+        )
+        np.einsum("iaja->aij", noise.reshape(3, 6, 3, 6))[...] = by_axis
+        covariance = by_start @ self._covariance @ by_start.T + by_noise @ noise @ by_noise.T
+        return states, (0.5 * (covariance + covariance.T))[None]
+
+    def by_start(self, time_s: float) -> FloatArray:
+        """(18, 18) Jacobian of the error at a time not before the start by the error at the start."""
+        return self._propagated(time_s)[1]
+
+    def _propagated(self, time_s: float) -> tuple[States, FloatArray, FloatArray]:
+        """State at a time, and the Jacobians of its error by that at the start and by the process noise."""
         start, dt_s = self._start, time_s - self.time_s
         linear, angular = (acceleration_response(dt_s, float(each)) for each in self._times_s)
         magnus_s2 = dt_s * dt_s / 12
@@ -81,13 +99,7 @@ class Propagator:
         by_start[3:6, 15:18] = J_r * angular[0] + magnus_by_rate * angular[1]
         by_noise[3:6, 3:6] = J_r
         by_noise[3:6, 9:12] = magnus_by_rate
-        by_start, by_noise = by_start[:dim], by_noise[:dim]
-        noise = np.zeros((STATE_DIM, STATE_DIM))
-        # Linear and angular noise, each for three axes.
-        by_axis = np.repeat(_process_noise(dt_s, self._times_s), 3, axis=0) * self._variances[:, None, None]
-        np.einsum("iaja->aij", noise.reshape(3, 6, 3, 6))[...] = by_axis
-        covariance = by_start @ self._covariance @ by_start.T + by_noise @ noise @ by_noise.T
-        return states, (0.5 * (covariance + covariance.T))[None]
+        return states, by_start, by_noise
 
 
 def acceleration_response(dt_s: float, time_s: float) -> _Vector:

@@ -52,6 +52,19 @@ class Trajectory:
     cross_covariance: FloatArray  # (K - 1, 18, 18) of each knot's error (rows) with the next one's (columns)
     # (K - 1, 6) acceleration sigmas of each step where they differ from those of ``prior``
     sigmas: FloatArray | None = None
+    # The same two covariances from the uncertainty of the set-up alone, which all states share; None: unknown
+    common: tuple[FloatArray, FloatArray] | None = None
+    process_noise_share: float = 1.0  # Of the prior's variances between the knots
+
+    def common_at(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> FloatArray | None:
+        """Return the (N, dim, dim) covariance of states at N times that the set-up's uncertainty adds; None: unknown."""
+        if self.common is None:
+            return None
+        covariance, cross_covariance = self.common
+        alone = replace(
+            self, covariance=covariance, cross_covariance=cross_covariance, process_noise_share=0.0
+        )
+        return alone.at(time_s, dim=dim)[1]
 
     def at(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """Return states at N times, and the (N, dim, dim) covariance of their leading error components; 6 is faster than 18."""
@@ -84,7 +97,10 @@ class Trajectory:
         step_s = np.abs(dt_s)[:, None]
         times_s, sigmas = self._times_s(), axis_sigmas(self.prior)
         phi = np.repeat(transition(step_s, times_s), 3, axis=1)
-        noise = np.repeat(process_noise(step_s, times_s), 3, axis=1) * (sigmas**2)[:, None, None]
+        noise = (
+            np.repeat(process_noise(step_s, times_s), 3, axis=1)
+            * (self.process_noise_share * sigmas**2)[:, None, None]
+        )
         # Backwards, velocity changes its sign, and with it its coupling to position and acceleration.
         flip = np.where(dt_s < 0, -1.0, 1.0)[:, None]
         for row, column in ((0, 1), (1, 0), (1, 2), (2, 1)):
@@ -151,7 +167,9 @@ class Trajectory:
         by_earlier[:, 3:6, 9:12] -= J_r @ (magnus_here[..., None] * skew(rate_here))
         by_earlier[:, 3:6, 3:6] += np.swapaxes(delta_R, 1, 2)
         sigmas = axis_sigmas(self.prior)[None] if self.sigmas is None else self.sigmas[later - 1]
-        process = to_error @ axes_to_state(conditional * (sigmas**2)[:, :, None, None])
+        process = to_error @ axes_to_state(
+            conditional * (self.process_noise_share * sigmas**2)[:, :, None, None]
+        )
         coupling = by_earlier @ self.cross_covariance[later - 1] @ np.swapaxes(by_later, 1, 2)
         covariance = (
             by_earlier @ self.covariance[later - 1] @ np.swapaxes(by_earlier, 1, 2)

@@ -126,7 +126,7 @@ def held_out(path: Path) -> None:
     recording = load_recording(path)
     origin_ns = min(measurement.stamp_ns for measurement in recording.measurements)
     observations, _ = build_observations(recording.parameters, recording.measurements, origin_ns=origin_ns)
-    found = held_out_errors(observations, recording.parameters.pipeline)
+    found = held_out_errors(observations, recording.parameters)
     continuous, linear = found["continuous"].statistics, found["linear"].statistics
     print(
         f"{path}: held-out mean {continuous.mean:.2f} of {linear.mean:.2f} mm ({continuous.mean / linear.mean:.2f}), 95 % "

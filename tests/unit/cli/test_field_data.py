@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -152,3 +153,18 @@ def test_robot_frame_keeps_the_layout(tsgt: Tsgt, field_data: Path, tmp_path: Pa
     published = np.loadtxt(field_data / "20220314" / "calibration_results.csv")[:3] * 1e3
     for (a, b), distance_mm in zip(combinations((1, 2, 3), 2), published, strict=True):
         assert result["inter_prism_mm"][f"{a}-{b}"]["reference"] == pytest.approx(distance_mm, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_report_of_the_field_data(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+    """With gaps and targets, without radio and timestamp bounds: all figures, nothing that is unknown as a number."""
+    pytest.importorskip("matplotlib")
+    recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=True)
+    assert tsgt("evaluate", recording, "--report", tmp_path / "report").code == 0
+    drawn = {path.stem for path in (tmp_path / "report").glob("*.png")}
+    assert {"map", "trajectory", "held_out", "distances", "residuals", "calibration", "gaps"} <= drawn
+    assert not drawn & {"radio", "clocks", "statuses", "reference_errors"}
+    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    text = re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL)
+    assert "accuracy of the clock synchronisation is unknown" in text
+    assert not re.search(r"\b(nan|inf|None)\b", text)

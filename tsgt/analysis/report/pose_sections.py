@@ -49,7 +49,11 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         ]
         header = ("estimator", "measurements", "mean", "median", "95 %")
         tables.append(
-            Table("Prediction error of left-out measurements, a point of a prism (mm)", header, tuple(rows))
+            Table(
+                "Error of the predicted positions of prisms, of measurements that were left out (mm)",
+                header,
+                tuple(rows),
+            )
         )
         held_out = f.held_out
         plots.append(

@@ -96,16 +96,17 @@ def _outlier_finding(analysis: Analysis) -> Finding:
         if (stations == row).any()
     }
     sizes_mm = 1e3 * np.linalg.norm(analysis.linearised.residuals_m[rows], axis=1)
-    listed = ", ".join(f"station {number} {count}" for number, count in counts.items())
+    listed = "".join(f"station {number} {count}, " for number, count in counts.items())
     return Finding(
         cause=OUTLIERS,
-        where=_stations(counts),
+        # Imported points are not attached to a station.
+        where=_stations(counts) if counts else "imported points",
         size=float(np.median(sizes_mm)),
         sigma=math.nan,
         unit="mm",
         effect_mm=0.0,
         confidence=0.99,
-        text=f"{len(rows)} single measurement{'s are' if len(rows) > 1 else ' is'} grossly wrong ({listed}; "
+        text=f"{len(rows)} single measurement{'s are' if len(rows) > 1 else ' is'} grossly wrong ({listed}"
         f"{sizes_mm.min():.0f} to {sizes_mm.max():.0f} mm); the trajectory does without.",
         repair="Nothing, if they are few. Otherwise look for reflections and for other prisms in view.",
         evidence={"count": counts, "largest_mm": float(sizes_mm.max())},

@@ -62,6 +62,7 @@ _SCALE_PARAMETER = (
     6  # Common factor on the noise; followed by each station's and component's deviation from it
 )
 _LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03, 0.7])
+_MIN_SIGMA = 3e-3
 _UPPER = np.log([30.0, 30.0, 10.0, 30.0, 30.0, 10.0, 20.0])
 # A prior of white acceleration follows every measurement if it may, and then there seems to be no noise. No instrument is
 # better than half its data sheet.
@@ -127,7 +128,7 @@ class _Segment:
                 initial_sigmas=initial,
                 adaptable=self.moving,
             )
-        self.local = (sigmas / initial) ** 2
+        self.local = (np.maximum(sigmas, np.minimum(initial, _MIN_SIGMA)) / initial) ** 2
         self.log_evidence = -np.inf
 
     def record(self, knots: States, log_evidence: float) -> None:
@@ -209,9 +210,13 @@ def maximise_evidence(
 
     found = maximise(start)
     if local:
-        for segment in segments:
-            segment.adapt(found.x)
-        found = maximise(found.x)
+        try:
+            for segment in segments:
+                segment.adapt(found.x)
+            found = maximise(found.x)
+        except GeometryError:
+            # Next to no process noise in a calm second, at the lower limit: singular to rounding. The first result holds.
+            pass
     prior, scales = _from_log_parameters(found.x)
     return Hyperparameters(
         prior, scales, overall_scale(observations, scales), -float(found.fun) / per_measurement

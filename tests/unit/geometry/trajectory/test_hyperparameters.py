@@ -252,6 +252,20 @@ def test_stationary_robot() -> None:
     assert found.noise_scale == pytest.approx(1.0, rel=0.15)
 
 
+def test_failed_adaptation_keeps_the_first_result(
+    observations: Observations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the adapted process noise makes the equations singular, the result is that without adaptation."""
+
+    def singular(*_: object) -> None:
+        raise GeometryError("the measurements do not determine the trajectory")
+
+    few = observations.select(slice(0, 150))
+    monkeypatch.setattr(hyperparameters._Segment, "adapt", singular)
+    found = tune(few, start=DRAWN_PRIOR, noise_only=True)
+    assert 0.5 < found.noise_scale < 2.0
+
+
 def test_too_few_measurements_are_rejected(observations: Observations) -> None:
     """Some seconds, or two prisms, raise an error that says what is missing."""
     with pytest.raises(GeometryError, match="too few measurements to tune the motion prior"):

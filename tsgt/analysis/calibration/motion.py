@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from tsgt.analysis.evaluation import (
     HeldOutErrors,
@@ -14,7 +14,7 @@ from tsgt.analysis.evaluation import (
     trajectory_errors,
 )
 from tsgt.errors import GeometryError
-from tsgt.estimation import build_observations
+from tsgt.estimation import build_observations, with_setup
 from tsgt.geometry.calibration import MotionCalibration, Setup, calibrate_motion, frames_from_motion
 from tsgt.geometry.trajectory import fit_trajectory, tune
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.geometry.calibration import SetupPrior
     from tsgt.geometry.trajectory import Observations
-    from tsgt.model import Matrix4, MotionPrior, Parameters, Vector3
+    from tsgt.model import MotionPrior, Parameters
     from tsgt.recording import Recording
 
 
@@ -103,7 +103,9 @@ def calibrate_recording(
                 observations, splits, {n: (c.setup, c.prior, c.noise_scales) for n, c in setups.items()}
             ),
         )
-    return CalibratedRecording(whole, _with_setup(recording.parameters, whole), comparison)
+    return CalibratedRecording(
+        whole, with_setup(recording.parameters, whole.parameters, whole.setup, whole.covariance), comparison
+    )
 
 
 def _cross_validated(
@@ -115,29 +117,6 @@ def _cross_validated(
         setup, prior, noise_scales = models[fold.number]
         training = setup.applied(observations.select(fold.training))
         trajectory = fit_trajectory(training, prior=prior, noise_scale=noise_scales).trajectory
-        return trajectory_errors(trajectory, setup.applied(observations.select(fold.test)))
+        return trajectory_errors(trajectory, setup.applied_in_place(observations.select(fold.test)))
 
     return cross_validate(splits, error_m)
-
-
-def _with_setup(parameters: Parameters, calibration: MotionCalibration) -> Parameters:
-    setup = calibration.setup
-    correction_m = setup.layout - calibration.initial.layout
-    stations = tuple(
-        replace(
-            station,
-            T_station1_station=_matrix(setup.frames[row]),
-            latency_ns=station.latency_ns + round(1e9 * float(setup.latencies_s[row])),
-        )
-        for row, station in enumerate(parameters.stations)
-    )
-    prisms = tuple(
-        replace(prism, position_m=cast("Vector3", tuple(map(float, prism.position_m + correction_m[row]))))
-        for row, prism in enumerate(parameters.prisms)
-    )
-    return replace(parameters, stations=stations, prisms=prisms)
-
-
-def _matrix(frame: FloatArray) -> Matrix4:
-    a, b, c, d = (tuple(map(float, row)) for row in frame)
-    return cast("Matrix4", (a, b, c, d))

@@ -10,11 +10,12 @@ import click
 import numpy as np
 
 from tsgt.analysis.calibration import calibrate_recording
-from tsgt.analysis.formats import write_prism_layout, write_station_frames
+from tsgt.analysis.formats import InstrumentErrors, write_prism_layout, write_station_frames
 from tsgt.cli.model_options import add_options
 from tsgt.cli.options import FiniteRange, OutputFile, json_option, keep_going_option, recording_argument
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
 from tsgt.geometry.calibration import SetupPrior, unobservable_directions
+from tsgt.model import SetupCovariance
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -130,6 +131,14 @@ def motion(
             {each.station: np.array(each.T_station1_station) for each in found.parameters.stations},
             {},
             latencies_ms={each.station: each.latency_ns / 1e6 for each in found.parameters.stations},
+            instrument_errors={
+                each.station: InstrumentErrors(
+                    vertical_index_rad=each.vertical_index_rad, collimation_rad=each.collimation_rad
+                )
+                for each in found.parameters.stations
+                if each.vertical_index_rad or each.collimation_rad
+            },
+            covariance=_of_stations(found.parameters.setup_covariance),
             comment=comment,
         )
     if prism_output is not None:
@@ -143,6 +152,19 @@ def motion(
         return 0
     click.echo("check failed: the held-out prediction error has grown", err=True)
     return CHECK_FAILED
+
+
+def _of_stations(covariance: SetupCovariance | None) -> SetupCovariance | None:
+    """Keep the components that a file of station frames has."""
+    if covariance is None:
+        return None
+    kept = [i for i, name in enumerate(covariance.components) if name.startswith("station")]
+    if not kept:
+        return None
+    return SetupCovariance(
+        components=tuple(covariance.components[i] for i in kept),
+        matrix=tuple(tuple(covariance.matrix[i][j] for j in kept) for i in kept),
+    )
 
 
 def _progress(step: str) -> None:

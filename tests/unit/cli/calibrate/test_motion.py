@@ -55,7 +55,13 @@ def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_
         assert abs(station["latency_ms"]) < 0.5
         assert len(station["sigma_mm"]) == len(station["sigma_mrad"]) == 3
     assert found["before"] is found["after"] is None
-    stations = load_station_calibration(output).stations
+    calibration = load_station_calibration(output)
+    stations = calibration.stations
+    known = calibration.covariance
+    assert known is not None
+    assert len(known.components) == 14  # frames and latencies of two stations
+    at = known.components.index("station2.latency")
+    assert 1e3 * np.sqrt(known.matrix[at][at]) == pytest.approx(found["stations"]["2"]["latency_sigma_ms"])
     assert sorted(stations) == [1, 2, 3]
     assert [list(row) for row in stations[2].T_station1_station] == found["stations"]["2"][
         "T_station1_station"

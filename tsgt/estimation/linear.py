@@ -18,6 +18,7 @@ from tsgt.estimation.completeness import CompletenessTracker
 from tsgt.estimation.pose_batch import PoseBatch, Reason
 from tsgt.estimation.pose_quality import degradations
 from tsgt.estimation.reference_point import poses_at
+from tsgt.estimation.setup_uncertainty import PointUncertainty
 from tsgt.estimation.tracks import Track, build_tracks, has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import (
     check_layout,
@@ -26,6 +27,7 @@ from tsgt.geometry import (
     interpolation_error_covariance,
     interpolation_error_s2,
     pose_covariance,
+    pose_displacement,
     poses_from_prisms,
     quaternion_from_rotation,
     twists,
@@ -56,6 +58,7 @@ class LinearEstimator:
         self._prisms = tuple(prism.prism for prism in parameters.prisms)
         self._layout = np.array([prism.position_m for prism in parameters.prisms])
         check_layout(self._layout, names=self._prisms)
+        self._uncertainty = PointUncertainty.of(parameters)
         self._stations = {station.station: station for station in parameters.stations}
         self._home_station = {s.prism: s.station for s in reversed(parameters.stations)}
         self._tracks = {prism: Track.empty() for prism in self._prisms}
@@ -233,6 +236,16 @@ class LinearEstimator:
             acceleration_sigma_mps2=self._limits.acceleration_sigma_mps2,
             angular_acceleration_sigma_radps2=self._limits.angular_acceleration_sigma_radps2,
         )
+        if self._uncertainty is not None:
+            displacement = pose_displacement(
+                self._layout,
+                rotation,
+                self._uncertainty.displacements(
+                    points[fitted], velocities[fitted], batch.station[rows], rotation
+                ),
+            )
+            batch.covariance_common[rows] = displacement @ displacement.swapaxes(1, 2)
+            batch.covariance[rows] += batch.covariance_common[rows]
         batch.velocity_mps[rows] = velocity
         batch.angular_velocity_radps[rows] = angular_velocity
         batch.residual_m[rows] = residual

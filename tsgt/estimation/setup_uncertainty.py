@@ -11,6 +11,8 @@ from tsgt.geometry.calibration import INSTRUMENT_ERRORS, Setup, SetupParameters,
 from tsgt.model import SetupCovariance
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, SetupJacobian
     from tsgt.model import Matrix4, Parameters, StationParameters, Vector3
@@ -55,6 +57,44 @@ def setup_jacobian(parameters: Parameters) -> SetupJacobian | None:
     return jacobian
 
 
+class PointUncertainty:
+    """Displacement of measured prisms by the set-up's errors, in the columns of a factor of their covariance."""
+
+    def __init__(self, parameters: Parameters, covariance: FloatArray, layout: SetupParameters) -> None:
+        self._layout = layout
+        self._factor = factor_of(covariance)
+        self._rows = {station.station: row for row, station in enumerate(parameters.stations)}
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> PointUncertainty | None:
+        """Return that of the parameters; None: unknown."""
+        layout = uncertain_setup(parameters)
+        covariance = stated_covariance(layout, parameters)
+        return None if covariance is None else cls(parameters, covariance, layout)
+
+    def displacements(
+        self,
+        points_m: FloatArray,
+        velocities_mps: FloatArray,
+        stations: NDArray[np.int64],
+        rotation: FloatArray,
+    ) -> FloatArray:
+        """(N, P, 3, r) of prisms, (N, P, 3), which these stations, (N, P), measured on a robot with rotations, (N, 3, 3).
+
+        A prism elsewhere on the robot is to a fit what a displacement of its measurement the other way is.
+        """
+        found = np.zeros((*points_m.shape, self._layout.count))
+        for prism in range(points_m.shape[1]):
+            for number in np.unique(stations[:, prism]).tolist():
+                rows = np.flatnonzero(stations[:, prism] == number)
+                found[rows, prism] = self._layout.point_jacobian(
+                    points_m[rows, prism], velocities_mps[rows, prism], self._rows[number]
+                )
+            found[:, prism][:, :, self._layout.prisms[prism]] -= rotation
+        displaced: FloatArray = found @ self._factor
+        return displaced
+
+
 def uncertain_setup(parameters: Parameters) -> SetupParameters:
     """Return the vector of all parameters of the set-up; stations rotate about the origin of frame ``station1``."""
     frames = np.array([*(s.T_station1_station for s in parameters.stations), np.eye(4)])
@@ -83,13 +123,11 @@ def with_setup(
     free = np.flatnonzero(np.diag(at_origins) > 0)
     matrix = 0.5 * (at_origins + at_origins.T)[np.ix_(free, free)]
     names = parameter_names(layout, parameters)
+    known = SetupCovariance(
+        components=tuple(names[i] for i in free), matrix=tuple(map(tuple, matrix.tolist()))
+    )
     return replace(
-        parameters,
-        stations=stations,
-        prisms=prisms,
-        setup_covariance=SetupCovariance(
-            components=tuple(names[i] for i in free), matrix=tuple(map(tuple, matrix.tolist()))
-        ),
+        parameters, stations=stations, prisms=prisms, setup_covariance=known if len(free) else None
     )
 
 

@@ -30,6 +30,7 @@ from tsgt.geometry.pose import (
     check_layout,
     interpolation_error_covariance,
     pose_covariance,
+    pose_displacement,
     poses_from_prisms,
     twists,
 )
@@ -78,6 +79,7 @@ __all__ = [
     "polar_jacobian",
     "polar_to_cartesian",
     "pose_covariance",
+    "pose_displacement",
     "poses_from_prisms",
     "quaternion_from_rotation",
     "raw_distance",

@@ -72,6 +72,18 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
     return 0.5 * (covariance + covariance.swapaxes(1, 2))
 
 
+def pose_displacement(layout: FloatArray, rotation: FloatArray, displacements: FloatArray) -> FloatArray:
+    """Displacement of the fitted pose, (N, 6, r), by r displacements of the prisms in the world, (N, P, 3, r).
+
+    With the arguments and the axes of :func:`pose_covariance`.
+    """
+    from_robot = rotation[:, None, None]
+    gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
+    in_world = (from_robot @ gain @ from_robot.swapaxes(-2, -1)).reshape(*displacements.shape[:2], 6, 3)
+    moved: FloatArray = (in_world @ displacements).sum(axis=1)
+    return moved
+
+
 def interpolation_error_covariance(
     layout: FloatArray,
     rotation: FloatArray,

@@ -228,6 +228,24 @@ class SetupParameters:
             jacobian[np.ix_(rows, each, columns)] = by_prism[rows]
         return jacobian
 
+    def point_jacobian(self, points_m: FloatArray, velocities_mps: FloatArray, station: int) -> FloatArray:
+        """(N, 3, G) displacement in frame ``station1`` of a station's measured points, (N, 3), at a given time."""
+        jacobian = np.zeros((len(points_m), 3, self.count))
+        for i in np.flatnonzero(self.stations == station):
+            jacobian[:, :, self.translations[i]] = np.eye(3)
+            jacobian[:, :, self.rotations[i]] = -skew(points_m - self.pivot)
+            jacobian[:, :, self.latencies[i]] = velocities_mps
+        frame = self.reference.frames[station]
+        axes, distance_m = line_of_sight_axes((points_m - frame[:3, 3]) @ frame[:3, :3])
+        along, horizontal, vertical = np.moveaxis(axes @ frame[:3, :3].T, 1, 0)
+        for i in np.flatnonzero(self.measured == station):
+            index, collimation, constant, scale = self.instrument[i]
+            jacobian[:, :, index] = -distance_m[:, None] * vertical
+            jacobian[:, :, collimation] = distance_m[:, None] * horizontal
+            jacobian[:, :, constant] = along
+            jacobian[:, :, scale] = distance_m[:, None] * along
+        return jacobian
+
 
 def _by_instrument_errors(
     observations: Observations, linearised: LinearisedMeasurements, setup: Setup

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.estimation import PoseBatch
-    from tsgt.geometry.calibration import Hypothesis
     from tsgt.model import MotionPrior, Parameters, ReferencePoint
     from tsgt.recording import Recording
 
@@ -164,59 +163,3 @@ def _motion_lines(prior: MotionPrior) -> list[str]:
         for key, value in dataclasses.asdict(prior).items()
     }
     return ["  [pipeline.motion]", *(f"  {key} = {value}" for key, value in values.items())]
-
-
-def refinement_keys(found: SmoothedRecording) -> dict[str, Any]:
-    """Return for ``--json`` what the measurements say about the set-up, and what was refined."""
-    refined = found.refinement
-    if refined is None:
-        return {"refinement": None}
-    return {
-        "refinement": {
-            "used": refined.used,
-            "log_bayes_factor": refined.log_bayes_factor,
-            "p_value": refined.p_value,
-            "birge_ratio": refined.birge_ratio,
-            "wander_ms": 1e3 * refined.wander_s,
-            "groups": [
-                {
-                    "kind": each.hypothesis.kind,
-                    _subject(each.hypothesis): _number(each.hypothesis, found.parameters),
-                    "log_bayes_factor": each.log_bayes_factor,
-                    "selected": each.selected,
-                    "components": list(each.hypothesis.components),
-                    "estimate": each.estimate.tolist(),
-                    "sigma": each.sigma.tolist(),
-                }
-                for each in sorted(refined.evidence, key=lambda each: -each.log_bayes_factor)
-            ],
-        }
-    }
-
-
-def refinement_text(found: SmoothedRecording) -> str:
-    """Return in words what was refined."""
-    refined = found.refinement
-    if refined is None:
-        return "Set-up: as recorded, not compared with the measurements"
-    if not refined.used:
-        return "Set-up: as recorded; the measurements do not contradict it"
-    selected = [
-        f"{each.hypothesis.kind.replace('_', ' ')} of "
-        f"{_subject(each.hypothesis)} {_number(each.hypothesis, found.parameters)}"
-        for each in refined.evidence
-        if each.selected
-    ]
-    beyond = f", beyond its stated uncertainty: {', '.join(selected)}" if selected else ""
-    return f"Set-up: refined within the trajectory{beyond}"
-
-
-def _number(hypothesis: Hypothesis, parameters: Parameters) -> int:
-    """Return the number of the station or prism that a hypothesis is about."""
-    if hypothesis.kind == "prism":
-        return parameters.prisms[hypothesis.row].prism
-    return parameters.stations[hypothesis.row].station
-
-
-def _subject(hypothesis: Hypothesis) -> str:
-    return "prism" if hypothesis.kind == "prism" else "station"

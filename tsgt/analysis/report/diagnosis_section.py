@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 COMPONENTS = ("range", "horizontal_angle", "zenith_angle")
 
 
-def diagnosis_section(diagnosis: Diagnosis | None, problem: str | None) -> Section:
-    """Return the section on the causes of errors; ``problem``: why they are unknown."""
+def diagnosis_section(diagnosis: Diagnosis | None, problem: str | None, refinement: str = "") -> Section:
+    """Return the section on the causes of errors; ``problem``: why they are unknown, ``refinement``: what was refined."""
     title = "Causes of errors"
     if diagnosis is None:
         return Section(title, (f"Unknown: {problem or 'there is no continuous trajectory'}.",))
@@ -45,7 +45,7 @@ def diagnosis_section(diagnosis: Diagnosis | None, problem: str | None) -> Secti
         rows = tuple((part.name, str(part.n), format_number(part.ratio, 2)) for part in diagnosis.held_out)
         caption = "Mean prediction error of left-out measurements by the estimator continuous, relative to linear (below 1: better)"
         tables.append(Table(caption, ("part of the drive", "measurements", "ratio"), rows))
-    return Section(title, (text,), tuple(tables))
+    return Section(title, (text, *filter(None, [refinement])), tuple(tables))
 
 
 def noise_factors(diagnosis: Diagnosis) -> dict[str, dict[str, float]]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from tsgt.analysis.evaluation import noise_scales_by_axis
 from tsgt.analysis.motion_plausibility import unfit_for_live
+from tsgt.analysis.refinement import refinement_keys
 from tsgt.analysis.report.calibration import calibration_numbers
 from tsgt.analysis.report.diagnosis_section import diagnosis_numbers
 from tsgt.analysis.report.findings import position_sigma_mm, rotation_sigma_deg
@@ -72,6 +73,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
         found["estimators_apart"] = difference_numbers(f.difference)
     if f.continuous is not None:
         motion = f.continuous.motion
+        found |= refinement_keys(f.continuous.refinement, f.continuous.parameters)
         found |= {
             "motion": dataclasses.asdict(motion.prior),
             "noise_scale": motion.noise_scale,

@@ -17,6 +17,7 @@ from tsgt.analysis.evaluation import (
     residual_statistics,
 )
 from tsgt.analysis.processing import process
+from tsgt.analysis.refinement import refinement_keys, refinement_text
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.cli.desk.live_poses import print_live
 from tsgt.cli.desk.reference import compare_estimators, print_comparisons
@@ -43,8 +44,6 @@ from tsgt.cli.recordings import (
     pose_summary,
     prisms_option,
     refine_option,
-    refinement_keys,
-    refinement_text,
 )
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.estimation import build_observations, build_tracks
@@ -194,7 +193,7 @@ def evaluate(
                 "inter_prism_static_mm": _figures(found.static),
                 **({} if diagnosis is None else {"diagnosis": diagnosis.numbers()}),
                 **({} if predicted is None else {"held_out_mm": _held_out_keys(predicted)}),
-                **refinement_keys(continuous),
+                **refinement_keys(continuous.refinement, continuous.parameters),
                 **motion_keys(continuous),
                 "residuals": {
                     station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
@@ -224,7 +223,7 @@ def evaluate(
     if predicted is not None:
         click.echo("\nHeld-out prediction error (mm)")
         _print_held_out(predicted)
-    click.echo(f"\n{refinement_text(continuous)}")
+    click.echo(f"\n{refinement_text(continuous.refinement, continuous.parameters)}")
     click.echo(f"\n{motion_text(continuous, parameters.pipeline.motion)}")
     click.echo("\nNormalised residuals of the continuous trajectory")
     rows = [

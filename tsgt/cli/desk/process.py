@@ -10,6 +10,7 @@ import click
 
 from tsgt.analysis.formats import pose_csv, tum_lines, valid_rows
 from tsgt.analysis.processing import process as process_recording
+from tsgt.analysis.refinement import refinement_keys, refinement_text
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.cli.options import (
     FiniteRange,
@@ -33,8 +34,6 @@ from tsgt.cli.recordings import (
     pose_summary,
     prisms_option,
     refine_option,
-    refinement_keys,
-    refinement_text,
     write_lines,
     write_recording,
 )
@@ -132,7 +131,11 @@ def process(
         **(
             {}
             if continuous is None
-            else {**motion_keys(continuous), **refinement_keys(continuous), "rest_s": continuous.fit.rest_s}
+            else {
+                **motion_keys(continuous),
+                **refinement_keys(continuous.refinement, continuous.parameters),
+                "rest_s": continuous.fit.rest_s,
+            }
         ),
     }
     if as_json:
@@ -141,7 +144,7 @@ def process(
     at = point_label(poses.reference_point)
     click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements, at {at}")
     if continuous is not None:
-        click.echo(refinement_text(continuous))
+        click.echo(refinement_text(continuous.refinement, continuous.parameters))
         click.echo(motion_text(continuous, loaded.parameters.pipeline.motion))
         click.echo(f"At rest: {continuous.fit.rest_s:.1f} s in {len(continuous.fit.rest)} intervals")
 

@@ -46,6 +46,9 @@ REJECTION_THRESHOLD = 30.0
 measurements of a station on a wrong prism, 500 sigmas off, rotated a robot by 0.13 rad about the line through its other two.
 """
 
+# Of a second search, where the first one left outliers beyond that threshold
+COARSE_NOISE_SCALES = (20.0, 4.0)
+
 INITIAL_VELOCITY_SIGMA_MPS = 10.0
 INITIAL_ANGULAR_VELOCITY_SIGMA_RADPS = 10.0
 INITIAL_POSITION_SIGMA_M = 1e4
@@ -160,6 +163,17 @@ def solve(
     found = _minimise(observations, knot_index, guess, process, anchor, max_iterations)
     if not reject_outliers or not (found.squared_distances > REJECTION_THRESHOLD**2).any():
         return found
+    # The guess of a rotation across the outage of a prism may lead to a local minimum, where good measurements are outliers.
+    if max_iterations >= MAX_ITERATIONS:
+        coarse = guess
+        for scale in COARSE_NOISE_SCALES:
+            rough = replace(observations, sigmas_m=scale * observations.sigmas_m)
+            coarse = _minimise(rough, knot_index, coarse, process, anchor, max_iterations).knots
+        found = min(
+            found,
+            _minimise(observations, knot_index, coarse, process, anchor, max_iterations),
+            key=lambda solution: solution.cost,
+        )
     # Only after convergence: far from the solution, good measurements exceed the threshold too.
     rejectable = np.ones(len(knot_index), np.bool_)
     second = _minimise(observations, knot_index, found.knots, process, anchor, max_iterations, rejectable)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from tsgt.model import Parameters
 
 MAX_ROUNDS = 5
+COARSE_NOISE_SCALES = (10.0, 1.0)  # First, so that a wrong set-up makes few outliers
 MIN_NOISE = 0.7  # A component whose noise the motion absorbs must not make everything else significant
 
 
@@ -69,10 +70,11 @@ def analyse(observations: Observations, parameters: Parameters, motion: MotionMo
     candidates = hypotheses(layout)
     # Noise from the most general model, as in any regression: a wrong set-up would pass for noise, and hide itself.
     everything = frozenset(candidates)
-    linearised = linearise_setup(layout, observations, np.zeros(len(layout)), motion.prior, floored(motion))
-    errors, _ = posterior(
-        linearised.information, Selection(linearised.information, nominal, candidates).prior(everything)
-    )
+    errors = np.zeros(len(layout))
+    for scale in COARSE_NOISE_SCALES:
+        linearised = linearise_setup(layout, observations, errors, motion.prior, scale * floored(motion))
+        prior = Selection(linearised.information, nominal, candidates).prior(everything)
+        errors, _ = posterior(linearised.information, prior)
     motion = estimate_motion_model(layout.corrected(observations, errors), parameters.pipeline)
     linearised = linearise_setup(layout, observations, errors, motion.prior, floored(motion))
     lock_loss = lock_losses(linearised, estimate_noise(linearised, floored(motion)).normalised)

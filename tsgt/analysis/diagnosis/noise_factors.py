@@ -28,6 +28,7 @@ MIN_GAPS = (
 MIN_LOSS_SHARE = 0.15  # Of all gaps
 _SIGNIFICANCE = 1e-5
 OUTLIER = 7.0  # Sigmas beyond which a measurement is a gross error
+_MIN_OUTLIER_M = 0.03  # Smaller ones are tails of the noise
 _OUTLIER_WEIGHT = 0.5  # Largest weight of a gross error in the fit
 _SIGMA_PER_MAD = 1.4826  # Of a normal distribution
 _MIN_ROBUST = 0.7  # A component that the motion absorbs must not make everything else significant
@@ -138,7 +139,8 @@ def single_outliers(linearised: Linearisation, normalised: FloatArray) -> NDArra
     """Rows of gross errors away from gaps."""
     beside, _ = beside_gaps(linearised.observations)
     size = np.nanmax(np.where(np.isfinite(normalised), np.abs(normalised), 0.0), axis=1)
-    return np.flatnonzero(~beside & (size > OUTLIER) & (linearised.weights < _OUTLIER_WEIGHT))
+    large = np.linalg.norm(deviations_m(linearised), axis=1) > _MIN_OUTLIER_M
+    return np.flatnonzero(~beside & (size > OUTLIER) & large & (linearised.weights < _OUTLIER_WEIGHT))
 
 
 def deviations_m(linearised: Linearisation) -> FloatArray:

@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from tsgt.geometry.calibration.hypotheses import Hypothesis, hypotheses
 from tsgt.geometry.calibration.joint_system import Segment, linearise_jointly, split_segments
+from tsgt.geometry.calibration.setup_parameters import deformation_modes
 from tsgt.geometry.calibration.setup_prior import factor_of
 from tsgt.geometry.calibration.timestamp_drift import (
     SegmentInformation,
@@ -36,6 +37,7 @@ MAX_SEGMENTS = 24  # A quarter of an hour: more would not change the choice, onl
 MAX_ITERATIONS = 4
 STEP_TOLERANCE = 0.1  # Squared length of a step, in sigmas of the set-up
 MIN_LOG_BAYES_FACTOR = 3.0  # Beyond the logarithm of the number of hypotheses
+ABSORBED = 1e-6  # Share of a parameter's own information below which a direction carries none
 MIN_LOG_BAYES_FACTOR_OF_USE = 20.0
 """Drives with an exact set-up, whose motion is not that of the prior, reached 15; the published ones have 120 and 320."""
 
@@ -186,11 +188,17 @@ def _fit(
     wander_s: float = 0.0,
 ) -> tuple[Setup, list[SegmentInformation]]:
     """Gauss-Newton on the set-up; return the last one, and the segments there, linearised, with gradients at the reference."""
+    # A rigid displacement of all prisms changes the motion prior's reference point alone, which is no information on it.
+    observable = np.eye(parameters.count)
+    modes, at_prisms = deformation_modes(setup.layout), parameters.prisms.ravel()
+    observable[np.ix_(at_prisms, at_prisms)] = modes @ modes.T
     for iteration in range(MAX_ITERATIONS):
         system = linearise_jointly(segments, parameters, setup, prior, noise_scale=noise_scales)
         at = parameters.local_coordinates(setup)
         found = [
-            SegmentInformation(information, gradient - information @ at)
+            SegmentInformation(
+                observable @ information @ observable, observable @ (gradient - information @ at)
+            )
             for information, gradient in map(_without_rounding, system.segments)
         ]
         found = _without_wander(found, parameters, wander_s)
@@ -203,15 +211,18 @@ def _fit(
 
 
 def _without_rounding(segment: SegmentInformation) -> SegmentInformation:
-    """Remove negative information, which rounding leaves in directions that the trajectory absorbs."""
+    """Remove what rounding leaves in directions that the trajectory absorbs."""
     variances = np.diag(segment.information)
     informed = variances > 0
     scale = np.sqrt(np.where(informed, variances, 1.0))
     normalised = 0.5 * (segment.information + segment.information.T) / np.outer(scale, scale)
     normalised[~informed] = normalised[:, ~informed] = 0.0
     values, vectors = np.linalg.eigh(normalised)
-    kept = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return SegmentInformation(kept @ kept.T, segment.gradient)
+    seen = values > ABSORBED
+    kept = scale[:, None] * vectors[:, seen]
+    # The search for the trajectory ends at a tolerance, which leaves a gradient in those directions.
+    gradient = kept @ (vectors[:, seen].T @ (segment.gradient / scale))
+    return SegmentInformation((kept * values[seen]) @ kept.T, gradient)
 
 
 def _without_wander(

@@ -99,7 +99,9 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
 }
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(c, marks=pytest.mark.slow) if c == "reference" else c for c in COMMANDS]
+)
 @examples(3)
 @given(damage=damages)
 @example(damage=UNDAMAGED)

@@ -170,6 +170,7 @@ def test_next_pose_is_due_at_the_deadline(measurements: list[PolarMeasurement]) 
     ),
     st.lists(st.integers(START, START + 40 * 10**9), max_size=20),
 )
+@pytest.mark.slow
 def test_replay_equals_the_stream(
     measurements: list[PolarMeasurement],
     others: list[tuple[int, ClockRecord | EventRecord | StatusRecord]],

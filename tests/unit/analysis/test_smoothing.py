@@ -199,6 +199,7 @@ def test_origin_of_the_layout_does_not_matter() -> None:
     np.testing.assert_array_equal(far.poses.reason, near.poses.reason)
 
 
+@pytest.mark.slow
 def test_predictions_do_not_depend_on_the_held_out_measurements() -> None:
     """Shifting a held-out measurement changes no prediction of its fold, with a set-up that is refined, including its own."""
     frame = np.array(SCENE.parameters.stations[1].T_station1_station)

@@ -60,6 +60,7 @@ def test_inter_prism_distances(
     assert result["epochs"] == expected.epochs
 
 
+@pytest.mark.slow
 def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """Raw distances while stationary at the start of the first segment are those of SOURCE.md."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
@@ -72,6 +73,7 @@ def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
         assert figures["valid"] >= 40
 
 
+@pytest.mark.slow
 def test_second_segment_has_no_stationary_interval(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """It has no static distances."""
     recording = imported(tsgt, field_data, "segment2", tmp_path / "r.jsonl", targets=False)
@@ -80,6 +82,7 @@ def test_second_segment_has_no_stationary_interval(tsgt: Tsgt, field_data: Path,
 
 
 @pytest.mark.parametrize(("segment", "estimator"), [("segment2", "linear"), (".", "continuous")])
+@pytest.mark.slow
 def test_evo_reads_the_trajectory(
     tsgt: Tsgt,
     field_data: Path,
@@ -146,6 +149,7 @@ def test_held_out_errors_of_the_field_data(
     assert found["valid_poses"] > 0.95 * found["poses"]
 
 
+@pytest.mark.slow
 def test_robot_frame_keeps_the_layout(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """Reference distances are those of the authors' calibration_results.csv."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)

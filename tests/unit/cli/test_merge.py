@@ -47,6 +47,7 @@ def test_merge_reports_each_journal(tsgt: Tsgt, run: MissionResult, tmp_path: Pa
     assert again["bound_ms"] == {"p50": None, "max": None}
 
 
+@pytest.mark.slow
 def test_merged_measurements_are_processed_and_exported(
     tsgt: Tsgt, run: MissionResult, tmp_path: Path
 ) -> None:

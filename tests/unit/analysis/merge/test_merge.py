@@ -93,6 +93,7 @@ def added_to(run: MissionResult, path: Path, *, without: int = 0) -> list[PolarM
 # --- Classic ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_outage_is_filled(outage: MissionResult, tmp_path: Path) -> None:
     """A merge yields poses during the outage, close to the true ones."""
     path = recording(outage, tmp_path / "r.jsonl")

@@ -175,6 +175,7 @@ def test_evaluate_agrees_for_points_and_raw_measurements(tsgt: Tsgt, recording: 
         assert a["inter_prism_mm"][pair]["mean"] == pytest.approx(b["inter_prism_mm"][pair]["mean"], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_evaluate_text_agrees_with_json(tsgt: Tsgt, recording: Path) -> None:
     """The tables have the figures of --json to a hundredth, and every figure is documented."""
     reference = recording.with_name("reference.tum")

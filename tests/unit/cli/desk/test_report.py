@@ -114,6 +114,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     )
 
 
+@pytest.mark.slow
 def test_page_embeds_all_figures(made: Made) -> None:
     """Each figure is also a PNG and a PDF file, and the page loads nothing else."""
     page = page_of(made)
@@ -125,6 +126,7 @@ def test_page_embeds_all_figures(made: Made) -> None:
     assert not re.search(r"https?:|url\(|@import", re.sub('base64,[^"]*', "", page))
 
 
+@pytest.mark.slow
 def test_page_starts_with_what_to_trust_and_the_map(made: Made) -> None:
     """Then the sections, each of which the navigation names."""
     page = page_of(made)
@@ -135,6 +137,7 @@ def test_page_starts_with_what_to_trust_and_the_map(made: Made) -> None:
     assert re.findall(r'<a href="#s\d+">(.*?)</a>', page) == re.findall(r'<h2 id="s\d+">(.*?)</h2>', page)
 
 
+@pytest.mark.slow
 def test_page_is_accessible(made: Made) -> None:
     """It has a language, headings without a skipped level, an alternative text for each image, and tables that can scroll."""
     page = page_of(made)
@@ -150,6 +153,7 @@ def test_page_is_accessible(made: Made) -> None:
     )
 
 
+@pytest.mark.slow
 def test_page_names_what_is_unknown(made: Made) -> None:
     """An import has no radio, no delays and no timestamp bounds: no zero and no NaN stands for them."""
     page = page_of(made)
@@ -159,6 +163,7 @@ def test_page_names_what_is_unknown(made: Made) -> None:
     assert json.loads(made.out)["stations"]["1"]["delay_median_s"] is None
 
 
+@pytest.mark.slow
 def test_json_agrees_with_report_and_evaluate(made: Made) -> None:
     """Equal keys have equal values; report.json holds what is printed."""
     printed = json.loads(made.out)
@@ -169,6 +174,7 @@ def test_json_agrees_with_report_and_evaluate(made: Made) -> None:
     assert set(printed["held_out_mm"]) == {"linear", "continuous"}
 
 
+@pytest.mark.slow
 def test_every_number_of_the_page_is_in_the_json(made: Made) -> None:
     """It covers key figures, tables and sentences, with their rounding."""
     page = page_of(made)

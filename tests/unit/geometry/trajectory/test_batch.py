@@ -59,6 +59,7 @@ def test_outliers_have_small_weights(observations: Observations) -> None:
     assert np.count_nonzero(found.weights < 0.5) == len(spoilt)
 
 
+@pytest.mark.slow
 def test_prism_missing_for_a_minute(observations: Observations) -> None:
     """Without one prism the covariance is larger."""
     late = observations.select((observations.prism != 1) | (observations.time_s > 60.0))

@@ -5,9 +5,9 @@ verdicts, sections, page and numbers. matplotlib and jinja2 are imported when a 
 """
 
 from tsgt.analysis.report.findings import Findings, collect_findings
-from tsgt.analysis.report.headline import Headline, headline
+from tsgt.analysis.report.headline import headline
 from tsgt.analysis.report.numbers import report_numbers
-from tsgt.analysis.report.page import Images, render_page
+from tsgt.analysis.report.page import Headline, Images, render_page
 from tsgt.analysis.report.sections import sections
 from tsgt.analysis.report.stations import StationRecord
 from tsgt.analysis.report.trajectory_sections import map_figure

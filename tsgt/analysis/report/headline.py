@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.analysis.report.numbers import pose_numbers
-from tsgt.analysis.report.page import format_number
+from tsgt.analysis.report.page import Headline, format_number
 from tsgt.analysis.report.verdicts import Level, verdicts
 from tsgt.estimation import Kind
 
@@ -17,16 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from tsgt.analysis.report.findings import Findings
-
-
-@dataclass(frozen=True, slots=True)
-class Headline:
-    """``key_figures`` (name, value) and three lists of sentences, in which `...` is a command: the verdicts, and their repairs."""
-
-    key_figures: tuple[tuple[str, str], ...]
-    trust: tuple[str, ...]
-    doubt: tuple[str, ...]
-    repairs: tuple[str, ...]
 
 
 def headline(f: Findings) -> Headline:

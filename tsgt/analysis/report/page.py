@@ -20,12 +20,21 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from tsgt.analysis.report.headline import Headline
     from tsgt.geometry import FloatArray
 
 MAX_LISTED = 20  # Rows of a table that may be long
 COLUMN_WIDTH_MM = 90.0  # One column of most journals: on a telephone its text is legible
 UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Headline:
+    """``key_figures`` (name, value) and three lists of sentences, in which `...` is a command: the verdicts, and their repairs."""
+
+    key_figures: tuple[tuple[str, str], ...]
+    trust: tuple[str, ...]
+    doubt: tuple[str, ...]
+    repairs: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -146,7 +146,8 @@ def test_held_out_errors_of_the_field_data(
     assert continuous["mean"] < expected.mean * linear["mean"]
     assert continuous["p95"] < expected.p95 * linear["p95"]
     assert continuous["gaps"]["mean"] < expected.at_gaps * linear["gaps"]["mean"]
-    assert found["valid_poses"] > 0.95 * found["poses"]
+    # The origin is 3.3 m from the prisms: uncertain rotations make some of its poses invalid.
+    assert found["valid_poses"] > 0.93 * found["poses"]
 
 
 @pytest.mark.slow

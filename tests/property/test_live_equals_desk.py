@@ -89,6 +89,7 @@ def poses(lines: list[bytes]) -> list[bytes]:
 
 @settings(max_examples=60)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30), st.floats(0.0, 5.0))
+@pytest.mark.slow
 def test_post_processing_equals_the_stream(
     measurements: list[PolarMeasurement], ticks_ns: list[int], wait_s: float
 ) -> None:
@@ -103,6 +104,7 @@ def test_post_processing_equals_the_stream(
 
 @settings(max_examples=60)
 @given(arrivals(FOUR), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
+@pytest.mark.slow
 def test_post_processing_equals_the_stream_with_two_stations_on_one_prism(
     measurements: list[PolarMeasurement], ticks_ns: list[int]
 ) -> None:

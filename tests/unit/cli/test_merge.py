@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import MissionResult
 
 
+pytestmark = pytest.mark.slow  # whole missions
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Half a minute with the protocol classic."""
@@ -47,7 +50,6 @@ def test_merge_reports_each_journal(tsgt: Tsgt, run: MissionResult, tmp_path: Pa
     assert again["bound_ms"] == {"p50": None, "max": None}
 
 
-@pytest.mark.slow
 def test_merged_measurements_are_processed_and_exported(
     tsgt: Tsgt, run: MissionResult, tmp_path: Path
 ) -> None:

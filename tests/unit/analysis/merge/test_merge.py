@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
     from tsgt.simulation.mission import Mission, MissionResult
 
+
+pytestmark = pytest.mark.slow  # whole missions
+
 S = 1_000_000_000
 
 
@@ -93,7 +96,6 @@ def added_to(run: MissionResult, path: Path, *, without: int = 0) -> list[PolarM
 # --- Classic ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_outage_is_filled(outage: MissionResult, tmp_path: Path) -> None:
     """A merge yields poses during the outage, close to the true ones."""
     path = recording(outage, tmp_path / "r.jsonl")
@@ -146,7 +148,6 @@ def test_copy_of_a_journal_adds_nothing(short: MissionResult, tmp_path: Path) ->
     assert measured(path) == journalled(short)
 
 
-@pytest.mark.slow
 def test_replay_ignores_merged_measurements(outage: MissionResult, tmp_path: Path) -> None:
     """They were not in the stream."""
     path = recording(outage, tmp_path / "r.jsonl")
@@ -180,7 +181,6 @@ def test_merge_after_a_kill_at_any_byte(short: MissionResult, tmp_path: Path) ->
         assert measured(path) == journalled(short)
 
 
-@pytest.mark.slow
 def test_restarts_of_master_and_station(tmp_path: Path) -> None:
     """A station restarts during an outage, and its Unix clock is set meanwhile."""
 
@@ -206,7 +206,6 @@ def test_restarts_of_master_and_station(tmp_path: Path) -> None:
     assert measured(path) == journalled(run)
 
 
-@pytest.mark.slow
 def test_repeated_unix_time_after_a_reboot(tmp_path: Path) -> None:
     """Without a battery-backed clock, times of two journals overlap; delivered measurements resolve the ambiguity."""
 
@@ -223,7 +222,6 @@ def test_repeated_unix_time_after_a_reboot(tmp_path: Path) -> None:
     assert measured(path) == journalled(run)
 
 
-@pytest.mark.slow
 def test_error_statuses_are_merged(tmp_path: Path) -> None:
     """A tilted instrument explains why ``linear`` has no poses."""
     scenario = ScenarioConfig(faults=(StatusFaultConfig(station=2, status="tilt", start_s=15.0, end_s=25.0),))
@@ -240,7 +238,6 @@ def test_error_statuses_are_merged(tmp_path: Path) -> None:
     assert merge(path, journals(run)).added == 0
 
 
-@pytest.mark.slow
 def test_measurements_long_before_the_master_are_excluded(tmp_path: Path) -> None:
     """Those from two minutes before its start on are merged."""
 
@@ -302,7 +299,6 @@ def test_instrument_time_sigma_is_not_added_twice(frames: MissionResult, tmp_pat
         assert known_s - 1e-9 <= sigma_s < 1.2 * known_s
 
 
-@pytest.mark.slow
 def test_restarts_and_reboots_over_superframe(tmp_path: Path) -> None:
     """Sequence numbers continue over restarts of the client; each boot has its own clock."""
 
@@ -326,7 +322,6 @@ def test_restarts_and_reboots_over_superframe(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.slow
 def test_reused_sequence_numbers(tmp_path: Path) -> None:
     """After the journals were deleted, the same numbers denote other measurements."""
     kept = tmp_path / "kept.jsonl"

@@ -81,6 +81,7 @@ def test_default_reference_is_the_median_of_fixed_solutions(tsgt: Tsgt, files: l
     assert re.search(r"^  single +20 ", outcome.out, flags=re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_prism_distances_of_a_recording_are_added(
     tsgt: Tsgt, files: list[Path], recording: Path, tmp_path: Path
 ) -> None:

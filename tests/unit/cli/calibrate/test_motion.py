@@ -69,6 +69,7 @@ def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_
     assert stations[3].latency_ns == round(1e6 * found["stations"]["3"]["latency_ms"])
 
 
+@pytest.mark.slow
 def test_result_is_independent_of_the_robot_origin(recording: Path) -> None:
     """With the origin some metres off the prisms the same frames and the same motion result."""
     near = load_recording(recording)

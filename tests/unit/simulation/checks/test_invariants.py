@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import MissionResult, StationLog
 
 
+pytestmark = pytest.mark.slow  # whole missions
+
+
 @pytest.fixture(scope="module", params=["classic", "superframe"])
 def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     """Half a minute without faults, with each protocol and each estimator."""
@@ -84,7 +87,6 @@ def test_altered_measurement_is_detected(result: MissionResult, change: dict[str
 
 @pytest.mark.parametrize("units", [0.49, 0.51])
 @pytest.mark.parametrize("key", ["horizontal_angle_rad", "zenith_angle_rad", "slope_distance_m"])
-@pytest.mark.slow
 def test_rounding_by_the_radio_is_accepted(result: MissionResult, key: str, units: float) -> None:
     """Half a unit of an angle or a distance over ``superframe``; ``classic`` rounds nothing."""
     measurements = result.master_logs[0].measurements

@@ -126,16 +126,6 @@ point_option = click.option(
     "[default: as recorded, else the robot's origin]",
 )
 
-POINT_METAVAR = "[NAME=]X,Y,Z[,QX,QY,QZ,QW]"
-
-point_option = click.option(
-    "--point",
-    type=PointType(),
-    metavar=POINT_METAVAR,
-    help="Point of the robot whose poses are given: position in m and quaternion in the robot frame.  "
-    "[default: as recorded, else the robot's origin]",
-)
-
 reference_point_option = click.option(
     "--reference-point",
     type=PointType(),

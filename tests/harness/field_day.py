@@ -341,7 +341,7 @@ def _track(
 
 
 def _lock_drifts(time_s: FloatArray, rng: np.random.Generator) -> list[FloatArray]:
-    """Errors across the line of sight beside each gap, (2, N) each: the lock drifts off for a second, and settles after."""
+    """Errors across the line of sight near each gap, (2, N) each: the lock drifts off for a second, and settles after."""
     drifts = []
     for after in np.flatnonzero(np.diff(time_s) > 0.9) + 1:
         angle, size_m = rng.uniform(-0.5, 0.5) + math.pi * rng.integers(2), rng.uniform(0.03, 0.08)

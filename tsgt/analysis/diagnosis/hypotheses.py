@@ -1,8 +1,8 @@
 """Which errors of the set-up the measurements show: Bayesian model selection over few, named causes. Sans-I/O.
 
-Each hypothesis gives some errors a wide prior beside the nominal one of all. The evidence of a set of hypotheses follows in
+Each hypothesis gives some errors a wide prior in addition to the nominal one of all. The evidence of a set of hypotheses follows in
 closed form from the quadratic information (R. E. Kass and A. E. Raftery, Bayes factors, JASA 90, 1995), so that all of them
-cost nothing beside the trajectory. Hypotheses are added, exchanged and removed one at a time while the evidence grows.
+cost nothing compared with the trajectory. Hypotheses are added, exchanged and removed one at a time while the evidence grows.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ def _lock_loss_finding(analysis: Analysis) -> Finding:
         unit="mm",
         effect_mm=1e3 * loss.rms_m,
         confidence=1.0 - min(loss.p_value, 1.0),
-        text=f"Locks drift off the prism before they are lost, or settle after: {loss.measurements} measurements beside "
+        text=f"Locks drift off the prism before they are lost, or settle after: {loss.measurements} measurements near "
         f"{loss.gaps} of {loss.all_gaps} gaps are off by {1e3 * loss.rms_m:.0f} mm (rms), at most {1e3 * loss.max_m:.0f} mm.",
         repair="Do not trust poses within a second of a gap of a station. Drive slower where the line of sight is interrupted, "
         "and keep other reflecting surfaces out of view.",

@@ -89,7 +89,7 @@ def _pattern(residuals: FloatArray, regressors: FloatArray) -> ResidualPattern |
 
 
 def _t_values(residuals: FloatArray, regressors: FloatArray) -> FloatArray:
-    """Estimates over their sigmas, with a constant beside the regressors; 0 for one that does not vary."""
+    """Estimates over their sigmas, with a constant near the regressors; 0 for one that does not vary."""
     spread = regressors.std(axis=0)
     varies = spread > 1e-9
     scaled = (regressors - regressors.mean(axis=0))[:, varies] / spread[varies]

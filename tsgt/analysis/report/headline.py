@@ -25,7 +25,7 @@ def headline(f: Findings) -> Headline:
     return Headline(
         key_figures=tuple(_key_figures(f)),
         trust=tuple(v.text for v in found if v.level is Level.GOOD),
-        doubt=tuple(prefix[v.level] + v.text for v in found if v.level in prefix),
+        caution=tuple(prefix[v.level] + v.text for v in found if v.level in prefix),
         # Each once, those of the worst verdicts first.
         repairs=tuple(dict.fromkeys(v.repair for v in found if v.repair)),
     )

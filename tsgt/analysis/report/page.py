@@ -33,7 +33,7 @@ class Headline:
 
     key_figures: tuple[tuple[str, str], ...]
     trust: tuple[str, ...]
-    doubt: tuple[str, ...]
+    caution: tuple[str, ...]
     repairs: tuple[str, ...]
 
 
@@ -139,7 +139,7 @@ def render_page(
         key_figures=headline.key_figures,
         headline=(
             ("good", "\N{CHECK MARK}", "What to trust", headline.trust or ("Nothing yet.",)),
-            ("care", "!", "What not to trust", headline.doubt or ("No objection was found.",)),
+            ("care", "!", "What not to trust", headline.caution or ("No objection was found.",)),
             ("todo", "\N{RIGHTWARDS ARROW}", "What to do", headline.repairs or ("Nothing.",)),
         ),
         map=path_map,

@@ -13,10 +13,10 @@ from harness.records import PARAMETERS
 from tsgt.analysis.diagnosis import Finding
 from tsgt.analysis.diagnosis.held_out_finding import Part, held_out_finding
 from tsgt.analysis.diagnosis.noise_factors import (
-    beside_gaps,
     component_noise,
     estimate_noise,
     lock_losses,
+    near_gaps,
     single_outliers,
 )
 from tsgt.analysis.diagnosis.setup_errors import Linearisation
@@ -78,14 +78,14 @@ def test_noise_factor_of_one_component() -> None:
 
 
 def test_noise_of_stated_size_is_no_loss_of_lock() -> None:
-    """Measurements beside gaps that are like the others are not reported."""
+    """Measurements near gaps that are like the others are not reported."""
     assert not any(losses(solved(seed)) for seed in range(20))
 
 
 def test_drifting_locks_are_found() -> None:
-    """Large residuals beside several gaps are a loss of lock; their size is the deviation from the others' prediction."""
+    """Large residuals near several gaps are a loss of lock; their size is the deviation from the others' prediction."""
     linearised = solved()
-    _, gap = beside_gaps(linearised.observations)
+    _, gap = near_gaps(linearised.observations)
     for number in np.unique(gap[gap >= 0])[::2]:
         linearised.residuals_m[np.flatnonzero(gap == number)[0], 1] = 0.02
     found = losses(linearised)
@@ -94,9 +94,9 @@ def test_drifting_locks_are_found() -> None:
 
 
 def test_no_verdict_rests_on_one_gap() -> None:
-    """Any number of large residuals beside a single gap is no loss of lock."""
+    """Any number of large residuals near a single gap is no loss of lock."""
     linearised = solved()
-    _, gap = beside_gaps(linearised.observations)
+    _, gap = near_gaps(linearised.observations)
     linearised.residuals_m[gap == 0, 1] = 0.05
     assert losses(linearised) is None
 
@@ -104,7 +104,7 @@ def test_no_verdict_rests_on_one_gap() -> None:
 def test_gross_errors_are_single_outliers() -> None:
     """They are named away from gaps, if the fit has lowered their weight."""
     linearised = solved()
-    _, gap = beside_gaps(linearised.observations)
+    _, gap = near_gaps(linearised.observations)
     row = int(np.flatnonzero(gap < 0)[40])
     linearised.residuals_m[row] = 0.5
     linearised.weights[row] = 1e-3

@@ -21,7 +21,8 @@ import numpy as np
 from measuring import Stopwatch, peak_memory_mb
 
 from tsgt.geometry import exp_so3, invert, transform_from, transform_points
-from tsgt.geometry.trajectory import FixedLagSmoother, Observations, fit_trajectory
+from tsgt.geometry.batch import fit_trajectory
+from tsgt.geometry.trajectory import FixedLagSmoother, Observations
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from tsgt.config import SuperframeMasterConfig
 from tsgt.estimation import build_observations
 from tsgt.estimation.observations import centroid_m
 from tsgt.geometry import log_so3
-from tsgt.geometry.trajectory import fit_trajectory, tune
+from tsgt.geometry.batch import fit_trajectory, tune
 from tsgt.log import configure_logging
 from tsgt.model import PipelineParameters
 from tsgt.recording import load_recording

@@ -19,7 +19,7 @@ import numpy as np
 
 from tsgt.analysis.calibration import calibrate_recording
 from tsgt.geometry import exp_so3
-from tsgt.geometry.calibration import SetupPrior
+from tsgt.geometry.motion_calibration import SetupPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:

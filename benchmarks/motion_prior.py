@@ -23,16 +23,16 @@ from tsgt.analysis.evaluation import (
 )
 from tsgt.analysis.evaluation.held_out import FOLDS
 from tsgt.estimation import build_observations
-from tsgt.geometry.trajectory import fit_trajectory
-from tsgt.geometry.trajectory.hyperparameters import log_parameters, maximise_evidence
+from tsgt.geometry.batch import fit_trajectory
+from tsgt.geometry.batch.hyperparameters import log_parameters, maximise_evidence
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from tsgt.analysis.evaluation import Fold
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.batch.hyperparameters import Hyperparameters
     from tsgt.geometry.trajectory import Observations
-    from tsgt.geometry.trajectory.hyperparameters import Hyperparameters
 
 # An acceleration that lasts a millisecond is white at any rate of measuring; one of a minute, over the steps between
 # measurements and over their neighbours', is the sum of white jerk.

@@ -23,7 +23,8 @@ from tsgt.analysis.evaluation.normalised_prediction import NormalisedErrorStatis
 from tsgt.config import ScenarioConfig, level_frame
 from tsgt.estimation import build_observations, instrument_time_sigma_s
 from tsgt.geometry import cartesian_to_polar, invert, log_so3, polar_to_cartesian, transform_points
-from tsgt.geometry.trajectory import Observations, TrajectoryFit, fit_trajectory, tune
+from tsgt.geometry.batch import TrajectoryFit, fit_trajectory, tune
+from tsgt.geometry.trajectory import Observations
 from tsgt.recording import load_recording
 from tsgt.simulation.world import World, scenario_world
 

@@ -28,7 +28,8 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.trajectory import Observations, fit_trajectory
+from tsgt.geometry.batch import fit_trajectory
+from tsgt.geometry.trajectory import Observations
 from tsgt.simulation.world import World, scenario_world
 
 HOUR_S = 3600.0

@@ -17,7 +17,7 @@ import numpy as np
 from harness.target_field import TargetField, frame_nees
 from scipy.special import chdtri
 
-from tsgt.geometry.calibration import (
+from tsgt.geometry.target_calibration import (
     DATA_SHEET_SIGMA,
     CauseKind,
     InstrumentError,

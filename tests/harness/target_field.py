@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry import cartesian_to_polar, exp_so3, log_so3
-from tsgt.geometry.calibration import DATA_SHEET_SIGMA, ERRORS, InstrumentError, TargetReadings
+from tsgt.geometry.target_calibration import DATA_SHEET_SIGMA, ERRORS, InstrumentError, TargetReadings
 from tsgt.model import TARGET_NOISE
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import NetworkCalibration
+    from tsgt.geometry.target_calibration import NetworkCalibration
 
 
 @dataclass(kw_only=True)

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tsgt.errors import GeometryError
 from tsgt.estimation import parameter_names
-from tsgt.geometry.calibration import Setup, SetupParameters, calibrated_covariance, refine_setup
+from tsgt.geometry.motion_calibration import Setup, SetupParameters, calibrated_covariance, refine_setup
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import Hypothesis, RefinedSetup
+    from tsgt.geometry.motion_calibration import Hypothesis, RefinedSetup
     from tsgt.geometry.trajectory import Observations
     from tsgt.model import MotionPrior, Parameters
 

@@ -27,7 +27,7 @@ from tsgt.estimation import (
     with_setup,
 )
 from tsgt.geometry import check_layout
-from tsgt.geometry.trajectory import NOISE_FLOOR_SHARE, fit_trajectory, overall_scale, tune, with_noise_floor
+from tsgt.geometry.batch import NOISE_FLOOR_SHARE, fit_trajectory, overall_scale, tune, with_noise_floor
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.refinement import Refine
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import RefinedSetup
-    from tsgt.geometry.trajectory import Observations, TrajectoryFit
+    from tsgt.geometry.batch import TrajectoryFit
+    from tsgt.geometry.motion_calibration import RefinedSetup
+    from tsgt.geometry.trajectory import Observations
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 

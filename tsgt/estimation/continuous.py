@@ -22,7 +22,8 @@ from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.setup_uncertainty import setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
-from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states, scale_noise
+from tsgt.geometry.batch import scale_noise
+from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

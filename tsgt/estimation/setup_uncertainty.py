@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from tsgt.geometry.calibration import INSTRUMENT_ERRORS, Setup, SetupParameters, factor_of
+from tsgt.geometry.motion_calibration import INSTRUMENT_ERRORS, Setup, SetupParameters, factor_of
 from tsgt.model import SetupCovariance
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from tsgt.estimation import (
 )
 from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.geometry import exp_so3
-from tsgt.geometry.trajectory import fit_trajectory
+from tsgt.geometry.batch import fit_trajectory
 from tsgt.model import SetupCovariance
 from tsgt.recording import Recording, RecordingHeader
 

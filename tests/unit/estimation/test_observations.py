@@ -9,7 +9,7 @@ from harness.scene import START, Motion, stationary_scene
 from tsgt.estimation import build_observations, build_tracks
 from tsgt.estimation.observations import INSTRUMENT_TIME_SIGMA_S, MIN_SIGMA_M, centroid_m
 from tsgt.geometry import exp_so3, log_so3
-from tsgt.geometry.trajectory import fit_trajectory
+from tsgt.geometry.batch import fit_trajectory
 from tsgt.model import InstrumentNoise, MotionPrior, PointMeasurement
 
 

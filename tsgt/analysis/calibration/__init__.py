@@ -2,7 +2,7 @@
 
 Comes in: target and prism files, a recording, the state of a target collection. Goes out: frames, prism positions and
 latencies with residuals, a check whether a station has moved, the next target to measure. The solvers are in
-``tsgt.geometry.calibration``.
+``tsgt.geometry.target_calibration`` and ``tsgt.geometry.motion_calibration``.
 """
 
 from tsgt.analysis.calibration.motion import CalibratedRecording, HeldOutComparison, calibrate_recording

@@ -15,15 +15,15 @@ from tsgt.analysis.evaluation import (
 )
 from tsgt.errors import GeometryError
 from tsgt.estimation import build_observations, with_setup
-from tsgt.geometry.calibration import MotionCalibration, Setup, calibrate_motion, frames_from_motion
-from tsgt.geometry.trajectory import fit_trajectory, tune
+from tsgt.geometry.batch import fit_trajectory, tune
+from tsgt.geometry.motion_calibration import MotionCalibration, Setup, calibrate_motion, frames_from_motion
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.analysis.evaluation import Fold
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import SetupPrior
+    from tsgt.geometry.motion_calibration import SetupPrior
     from tsgt.geometry.trajectory import Observations
     from tsgt.model import MotionPrior, Parameters
     from tsgt.recording import Recording

@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry import log_so3
-from tsgt.geometry.calibration import (
+from tsgt.geometry.target_calibration import (
     FALSE_ALARM_RATE,
     MIN_POINTS,
     STATION_LIMITS,
@@ -24,7 +24,7 @@ from tsgt.geometry.calibration import (
 )
 
 if TYPE_CHECKING:
-    from tsgt.geometry.calibration import PointName, PointSet
+    from tsgt.geometry.target_calibration import PointName, PointSet
 
 MIN_TARGETS_FOR_HEADING = 2
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from tsgt.analysis.calibration.targets import solve_stations
 from tsgt.analysis.formats import TargetFile, TargetMeasurement, read_partial_target_file
 from tsgt.errors import DegenerateGeometryError, InputFileError
-from tsgt.geometry.calibration import MIN_POINTS
+from tsgt.geometry.target_calibration import MIN_POINTS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence

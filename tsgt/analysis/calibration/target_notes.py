@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.calibration import DATA_SHEET_SIGMA, CauseKind, InstrumentError
+from tsgt.geometry.target_calibration import DATA_SHEET_SIGMA, CauseKind, InstrumentError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.analysis.calibration.targets import TargetCalibration
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import Cause, FitQuality
+    from tsgt.geometry.target_calibration import Cause, FitQuality
 
 NOISE_LEVEL = 1e-3  # Probability by chance of a misfit that is called noise larger than stated
 SPEC_FACTOR = 3.0  # Data sheet's sigmas that an instrument error surely exceeds if it is reported as one

@@ -12,7 +12,7 @@ import numpy as np
 from tsgt.analysis.formats import InstrumentErrors
 from tsgt.errors import DegenerateGeometryError, InputFileError
 from tsgt.geometry import check_layout, corrected_distance, measurement_covariance, polar_to_cartesian
-from tsgt.geometry.calibration import (
+from tsgt.geometry.target_calibration import (
     CONSISTENCY,
     ERRORS,
     InstrumentError,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.formats import PrismFile, TargetFile, TargetMeasurement
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import (
+    from tsgt.geometry.target_calibration import (
         Check,
         Column,
         ErrorEstimate,

@@ -16,8 +16,8 @@ import numpy as np
 from tsgt.analysis.evaluation.normalised_prediction import near_loss, normalised_prediction_errors
 from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.smoothing import estimate_motion_model
-from tsgt.geometry.calibration import Setup
-from tsgt.geometry.trajectory import fit_trajectory, scale_noise
+from tsgt.geometry.batch import fit_trajectory, scale_noise
+from tsgt.geometry.motion_calibration import Setup
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.trajectory import TrajectoryFit
+    from tsgt.geometry.batch import TrajectoryFit
     from tsgt.model import Measurement
 
 POLAR_AXES = ("range", "horizontal_angle", "zenith_angle")

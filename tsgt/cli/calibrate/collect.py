@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.calibration import StationTarget
     from tsgt.cli.calibrate.operator import Operator
     from tsgt.cli.calibrate.session import TargetSession
-    from tsgt.geometry.calibration import FrameCalibration, PointName
+    from tsgt.geometry.target_calibration import FrameCalibration, PointName
 
 KEYS = "Enter measures, s skips, r repeats the last one (r 3: target 3, r 2 3: of station 2), q quits"
 

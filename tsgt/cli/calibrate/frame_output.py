@@ -12,7 +12,7 @@ from tsgt.cli.output import numbers, print_table
 from tsgt.geometry import cartesian_to_polar
 
 if TYPE_CHECKING:
-    from tsgt.geometry.calibration import FrameCalibration, WeakAxis
+    from tsgt.geometry.target_calibration import FrameCalibration, WeakAxis
 
 TARGET_CONSTANT = "--target-constant-mm"
 

@@ -26,14 +26,14 @@ from tsgt.cli.calibrate.motion import motion
 from tsgt.cli.calibrate.targets import targets
 from tsgt.cli.options import constant_m, constant_option, json_option
 from tsgt.cli.output import CHECK_FAILED, numbers, print_json, print_table, refuse_overwrite
-from tsgt.geometry.calibration import BODY_LIMITS
+from tsgt.geometry.target_calibration import BODY_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.calibration import FrameCalibration
+    from tsgt.geometry.target_calibration import FrameCalibration
 
 PRISM_CONSTANT = "--prism-constant-mm"
 

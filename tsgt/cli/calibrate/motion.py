@@ -14,7 +14,7 @@ from tsgt.analysis.formats import InstrumentErrors, write_prism_layout, write_st
 from tsgt.cli.model_options import add_options
 from tsgt.cli.options import FiniteRange, OutputFile, json_option, keep_going_option, recording_argument
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
-from tsgt.geometry.calibration import SetupPrior, unobservable_directions
+from tsgt.geometry.motion_calibration import SetupPrior, unobservable_directions
 from tsgt.model import SetupCovariance
 from tsgt.recording import load_recording
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.calibration import CalibratedRecording, HeldOutComparison
     from tsgt.analysis.evaluation import HeldOutErrors
-    from tsgt.geometry.calibration import UnobservableDirection
+    from tsgt.geometry.motion_calibration import UnobservableDirection
 
 UNKNOWN_SHIFT_M = 10.0
 UNKNOWN_TURN_RAD = 0.2

@@ -29,13 +29,13 @@ from tsgt.cli.calibrate.frame_output import (
 )
 from tsgt.cli.options import FiniteRange, constant_m, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite
-from tsgt.geometry.calibration import InstrumentError
+from tsgt.geometry.target_calibration import InstrumentError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.analysis.calibration import Exclusion
-    from tsgt.geometry.calibration import Check, FitQuality
+    from tsgt.geometry.target_calibration import Check, FitQuality
 
 _UNITS = {
     InstrumentError.VERTICAL_INDEX: ("vertical_index_mrad", 1e3),

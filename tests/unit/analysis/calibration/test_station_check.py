@@ -18,7 +18,7 @@ from tsgt.geometry import (
     transform_from,
     transform_points,
 )
-from tsgt.geometry.calibration import PointSet
+from tsgt.geometry.target_calibration import PointSet
 from tsgt.model import TARGET_NOISE
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import pytest
 from harness.prior_motion import draw_motions, measure, sorted_by_time
 
 from tsgt.analysis.evaluation import NormalisedErrorStatistics, near_loss, normalised_prediction_errors
-from tsgt.geometry.trajectory import fit_trajectory, scale_noise
+from tsgt.geometry.batch import fit_trajectory, scale_noise
 from tsgt.model import MotionPrior
 
 PRIOR = MotionPrior()

@@ -8,11 +8,12 @@ import pytest
 from harness.prior_motion import as_cartesian, draw_motions, measure, sorted_by_time
 
 from tsgt.analysis.evaluation import outliers, residual_statistics
-from tsgt.geometry.trajectory import fit_trajectory
+from tsgt.geometry.batch import fit_trajectory
 from tsgt.model import MotionPrior, PolarMeasurement
 
 if TYPE_CHECKING:
-    from tsgt.geometry.trajectory import Observations, TrajectoryFit
+    from tsgt.geometry.batch import TrajectoryFit
+    from tsgt.geometry.trajectory import Observations
 
 PRIOR = MotionPrior()
 

@@ -13,7 +13,7 @@ import pytest
 from harness.target_field import TargetField
 
 from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_calibration
-from tsgt.geometry.calibration import InstrumentError
+from tsgt.geometry.target_calibration import InstrumentError
 
 if TYPE_CHECKING:
     from harness.cli import Tsgt

@@ -12,7 +12,7 @@ from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_
 from tsgt.analysis.calibration import calibrate_recording
 from tsgt.config import load_station_calibration
 from tsgt.geometry import exp_so3
-from tsgt.geometry.calibration import SetupPrior
+from tsgt.geometry.motion_calibration import SetupPrior
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:

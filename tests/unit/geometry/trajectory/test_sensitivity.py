@@ -10,8 +10,8 @@ import pytest
 from harness.prior_motion import draw_motions, measure, rows_at, sorted_by_time
 from scipy.stats import chi2
 
-from tsgt.geometry.calibration import Setup, SetupParameters, SetupPrior
-from tsgt.geometry.trajectory import fit_trajectory
+from tsgt.geometry.batch import fit_trajectory
+from tsgt.geometry.motion_calibration import Setup, SetupParameters, SetupPrior
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

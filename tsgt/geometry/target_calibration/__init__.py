@@ -1,0 +1,73 @@
+"""Station frames, instrument errors and prism positions from measured targets: one network adjustment. Sans-I/O.
+
+In: polar readings of targets by each station, or points with covariances in two frames. Out: rigid transforms, instrument
+errors and prism positions with their joint covariance, checks of the fit, and the causes of misfit with what would repair them.
+"""
+
+from tsgt.geometry.target_calibration.adjustment import (
+    ErrorEstimate,
+    FitQuality,
+    NetworkCalibration,
+    calibrate_network,
+)
+from tsgt.geometry.target_calibration.causes import Cause, CauseKind, rejected_targets
+from tsgt.geometry.target_calibration.frame_fit import FrameFit, PointName, PointPairs, PointSet, fit_frame
+from tsgt.geometry.target_calibration.network import (
+    DATA_SHEET_SIGMA,
+    ERRORS,
+    Column,
+    InstrumentError,
+    TargetReadings,
+)
+from tsgt.geometry.target_calibration.prisms import (
+    BODY_LIMITS,
+    FALSE_ALARM_RATE,
+    MIN_POINTS,
+    STATION_LIMITS,
+    FrameCalibration,
+    PrismCalibration,
+    WeakAxis,
+    calibrate_frame,
+    calibrate_prisms,
+)
+from tsgt.geometry.target_calibration.station_frames import (
+    CONSISTENCY,
+    Check,
+    checks,
+    station_frames,
+    unweighted_frames,
+)
+
+__all__ = [
+    "BODY_LIMITS",
+    "CONSISTENCY",
+    "DATA_SHEET_SIGMA",
+    "ERRORS",
+    "FALSE_ALARM_RATE",
+    "MIN_POINTS",
+    "STATION_LIMITS",
+    "Cause",
+    "CauseKind",
+    "Check",
+    "Column",
+    "ErrorEstimate",
+    "FitQuality",
+    "FrameCalibration",
+    "FrameFit",
+    "InstrumentError",
+    "NetworkCalibration",
+    "PointName",
+    "PointPairs",
+    "PointSet",
+    "PrismCalibration",
+    "TargetReadings",
+    "WeakAxis",
+    "calibrate_frame",
+    "calibrate_network",
+    "calibrate_prisms",
+    "checks",
+    "fit_frame",
+    "rejected_targets",
+    "station_frames",
+    "unweighted_frames",
+]

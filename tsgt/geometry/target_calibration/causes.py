@@ -1,0 +1,315 @@
+"""Causes of a misfit of target measurements: instrument errors, wrong sights of targets, a tripod that moved.
+
+A *sight* is all readings of one target by one station. The causes that the readings support are selected together, so that
+an index error is not taken for bad far targets nor the reverse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import chdtri
+
+from tsgt.geometry.target_calibration.cause_search import CauseSearch
+from tsgt.geometry.target_calibration.network import (
+    DATA_SHEET_SIGMA,
+    ERRORS,
+    TARGET_CONSTANT,
+    InstrumentError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.target_calibration.network import Linearisation, TargetReadings
+
+
+class CauseKind(StrEnum):
+    """What a cause is."""
+
+    INSTRUMENT = "instrument"
+    TARGET_CONSTANT = "target_constant"  # Of all stations alike
+    SIGHT = "sight"
+    TRIPOD = "tripod"  # Moved between two of a station's sights
+    TILT = "tilt"  # Of a station that is taken as levelled
+
+
+INSTRUMENT_FALSE_ALARM_RATE = 1e-3  # Of any instrument error, in a set that matches its noise model
+DATA_SHEET_FALSE_ALARM_RATE = 0.05  # The same of errors within the data sheet, which every instrument has
+SIGHT_FALSE_ALARM_RATE = 1e-4  # Of any sight; the same for a tripod and a tilt
+MAX_SIGHTS = 60  # Candidates; of a larger set those with the largest residuals
+ODDS: dict[CauseKind, float] = {
+    CauseKind.INSTRUMENT: 6.0,
+    CauseKind.TARGET_CONSTANT: 6.0,
+    CauseKind.SIGHT: 6.0,
+    CauseKind.TRIPOD: 10.0,
+    CauseKind.TILT: 6.0,
+}
+"""Twice the negative logarithm of the odds: one in 20 for a wrong sight or an instrument outside its data sheet, one in 150 for
+a tripod that moves."""
+LARGEST_ERROR = {
+    InstrumentError.VERTICAL_INDEX: 2e-3,
+    InstrumentError.COLLIMATION: 2e-3,
+    InstrumentError.RANGE_SCALE: 3e-4,
+    InstrumentError.RANGE_CONSTANT: 0.05,
+}
+"""Beyond, something else is wrong: 2 mrad are 7 arcminutes, 300 ppm an atmosphere of 300 degrees, 50 mm more than any two
+reflectors differ."""
+MIN_TARGETS_PER_ROUND = 3  # Before and after a tripod moved, to tell it from wrong sights
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cause:
+    """One possible cause, and its size if it was selected."""
+
+    kind: CauseKind
+    station: int  # Row; 0 if it concerns all
+    target: int | None = None  # Row; of a tripod the first one measured after it moved
+    error: InstrumentError | None = None
+    # Only two stations measured the target: which of them is wrong cannot be seen
+    either_station: bool = False
+    # INSTRUMENT: an error of the size that the data sheet allows, with its sigma as prior; False: of any size
+    within_data_sheet: bool = False
+    # INSTRUMENT: (1,) its value; TARGET_CONSTANT: (1,) m; SIGHT: (3,) displacement in the first station's frame in m;
+    # TRIPOD: (4,) displacement in m and heading in rad; TILT: (2,) rad
+    value: FloatArray | None = None
+    alternatives: tuple[Cause, ...] = ()  # Causes that the readings do not exclude in its place
+
+    @property
+    def label(self) -> tuple[CauseKind, int, int | None, InstrumentError | None]:
+        """What identifies it."""
+        return self.kind, self.station, self.target, self.error
+
+    @property
+    def size_m(self) -> float:
+        """Length of a displacement."""
+        assert self.value is not None  # noqa: S101 (of selected causes)
+        return float(np.linalg.norm(self.value[:3]))
+
+
+@dataclass(frozen=True, slots=True)
+class SelectionRules:
+    """What may be selected.
+
+    ``blunder_m``: smallest displacement of a sight; ``levelled``: look for tilts.
+    """
+
+    blunder_m: float
+    levelled: bool
+
+
+def max_rejected(targets: int) -> int:
+    """Most targets of a station that may be rejected: at least four remain, and most of all."""
+    return max((targets - 3) // 2, 0)
+
+
+def select_causes(
+    readings: TargetReadings, linear: Linearisation, rules: SelectionRules
+) -> tuple[Cause, ...]:
+    """Select the causes that explain the misfit of a linearisation without any of them."""
+    candidates = _candidates(readings, linear, rules)
+    while True:
+        columns = np.concatenate([columns for _, columns, _ in candidates], axis=2)
+        residuals = linear.project(linear.y[:, :, None])[:, :, 0]
+        ends = np.cumsum([0, *(each.shape[2] for _, each, _ in candidates)])
+        causes = [cause for cause, _, _ in candidates]
+        search = CauseSearch(
+            columns.reshape(-1, columns.shape[2]),
+            linear.project(columns).reshape(-1, columns.shape[2]),
+            residuals.ravel(),
+            redundancy=linear.redundancy,
+            blocks=[range(a, b) for a, b in pairwise(ends)],
+            priors=np.concatenate(
+                [np.full(columns.shape[2], _prior_information(cause)) for cause, columns, _ in candidates]
+            ),
+            penalties=np.array([penalty for _, _, penalty in candidates]),
+            odds=np.array([_odds(cause) for cause in causes]),
+            allowed=lambda subset, causes=causes: _is_possible([causes[row] for row in subset]),  # type: ignore[misc]
+        )
+        chosen = search.best()
+        values = search.estimates(chosen)
+        implausible = {row for row in chosen if not _is_plausible(causes[row], values[row], rules)}
+        if not implausible:
+            break
+        candidates = [each for row, each in enumerate(candidates) if row not in implausible]
+    alternatives = search.alternatives(chosen)
+    # Of causes that the readings do not tell apart: a tilt fails a check, where an instrument error would be applied; wrong
+    # sights are more frequent than tripods that move.
+    preferred = {CauseKind.INSTRUMENT: CauseKind.TILT, CauseKind.TRIPOD: CauseKind.SIGHT}
+    exchanged = tuple(
+        next(
+            (other for other in alternatives[row] if causes[other].kind is preferred.get(causes[row].kind)),
+            row,
+        )
+        for row in chosen
+    )
+    if exchanged != chosen and len(set(exchanged)) == len(exchanged):
+        chosen, values = exchanged, search.estimates(exchanged)
+        alternatives = search.alternatives(chosen)
+
+    def is_alternative(row: int, other: int) -> bool:
+        exchanged = tuple(other if each == row else each for each in chosen)
+        if not _is_possible([causes[each] for each in exchanged]) or causes[other].label == causes[row].label:
+            return False
+        return _is_plausible(causes[other], search.estimates(exchanged)[other], rules)
+
+    return tuple(
+        replace(
+            causes[row],
+            value=values[row][: ends[row + 1] - ends[row]],
+            alternatives=tuple(causes[other] for other in alternatives[row] if is_alternative(row, other)),
+        )
+        for row in chosen
+    )
+
+
+_Candidate = tuple[Cause, "FloatArray", float]  # Cause, columns (n, 3, c), penalty
+
+
+def _candidates(readings: TargetReadings, linear: Linearisation, rules: SelectionRules) -> list[_Candidate]:
+    stations = range(len(readings.stations))
+    usual, instruments = (
+        [
+            (
+                Cause(CauseKind.INSTRUMENT, station, error=error, within_data_sheet=within),
+                linear.columns(((station, 6 + row),)),
+            )
+            for station in stations
+            for row, error in enumerate(ERRORS)
+        ]
+        for within in (True, False)
+    )
+    instruments.append((Cause(CauseKind.TARGET_CONSTANT, 0), linear.columns((TARGET_CONSTANT,))))
+    sights = _sights(readings, linear)
+    tripods = _tripods(readings, linear)
+    tilts = (
+        [
+            (Cause(CauseKind.TILT, station), linear.columns(((station, 3), (station, 4))))
+            for station in stations[1:]
+        ]
+        if rules.levelled
+        else []
+    )
+    groups = (
+        (usual, DATA_SHEET_FALSE_ALARM_RATE),
+        (instruments, INSTRUMENT_FALSE_ALARM_RATE),
+        (sights, SIGHT_FALSE_ALARM_RATE),
+        (tripods, SIGHT_FALSE_ALARM_RATE),
+        (tilts, SIGHT_FALSE_ALARM_RATE),
+    )
+    return [
+        (
+            cause,
+            columns,
+            float(chdtri(columns.shape[2], rate / len(group)))
+            - (0.0 if group is instruments else _odds(cause)),
+        )
+        for group, rate in groups
+        for cause, columns in group
+    ]
+
+
+def _sights(readings: TargetReadings, linear: Linearisation) -> list[tuple[Cause, FloatArray]]:
+    """Displacements of targets as measured by one station."""
+    residuals = np.sum(linear.project(linear.y[:, :, None]) ** 2, axis=(1, 2))
+    found = []
+    for target in range(len(readings.targets)):
+        of_target = readings.target == target
+        measured_by = np.unique(readings.station[of_target])
+        either = len(measured_by) == 2
+        for station in measured_by[1:] if either else measured_by:
+            rows = of_target & (readings.station == station)
+            if len(measured_by) > 1:
+                cause = Cause(CauseKind.SIGHT, int(station), target, either_station=either)
+                found.append((float(residuals[rows].sum()), cause, rows))
+    found.sort(key=lambda each: -each[0])
+    return [(cause, linear.B * rows[:, None, None]) for _, cause, rows in found[:MAX_SIGHTS]]
+
+
+def _tripods(readings: TargetReadings, linear: Linearisation) -> list[tuple[Cause, FloatArray]]:
+    """Displacements and turns of a station after some of its readings, in their order."""
+    found = []
+    for station in range(len(readings.stations)):
+        own = np.flatnonzero(readings.station == station)
+        splits = 0
+        for place in range(1, len(own)):
+            before, after = own[:place], own[place:]
+            if readings.target[before[-1]] == readings.target[after[0]]:
+                continue
+            sizes = [len(np.unique(readings.target[rows])) for rows in (before, after)]
+            if min(sizes) < MIN_TARGETS_PER_ROUND or splits >= MAX_SIGHTS // 3:
+                continue
+            splits += 1
+            later = np.zeros(len(readings.station), dtype=bool)
+            later[after] = True
+            cause = Cause(CauseKind.TRIPOD, station, int(readings.target[after[0]]))
+            pose = tuple((station, component) for component in (0, 1, 2, 5))
+            found.append((cause, linear.columns(pose) * later[:, None, None]))
+    return found
+
+
+def _is_plausible(cause: Cause, value: FloatArray, rules: SelectionRules) -> bool:
+    size = float(np.linalg.norm(value[:3]))
+    if cause.kind is CauseKind.SIGHT:
+        return size >= rules.blunder_m
+    if cause.kind is CauseKind.TARGET_CONSTANT:
+        return size <= LARGEST_ERROR[InstrumentError.RANGE_CONSTANT]
+    return cause.error is None or size <= LARGEST_ERROR[cause.error]
+
+
+def _prior_information(cause: Cause) -> float:
+    """Information of the data sheet on an instrument error that it allows."""
+    return DATA_SHEET_SIGMA[cause.error] ** -2.0 if cause.error and cause.within_data_sheet else 0.0
+
+
+def _odds(cause: Cause) -> float:
+    return 0.0 if cause.within_data_sheet else ODDS[cause.kind]
+
+
+def _is_possible(causes: Sequence[Cause]) -> bool:
+    """No instrument error twice, and no tripod that moved twice."""
+    once = [
+        (cause.kind, cause.station, cause.error)
+        for cause in causes
+        if cause.kind in (CauseKind.INSTRUMENT, CauseKind.TRIPOD)
+    ]
+    return len(set(once)) == len(once)
+
+
+def outvoted(readings: TargetReadings, causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """Return the causes without the sights of stations of which too many targets are wrong to reject them."""
+    refused: set[int] = set()
+    for station in range(1, len(readings.stations)):
+        of_first, of_other = (set(readings.target[readings.station == row].tolist()) for row in (0, station))
+        rejected = rejected_targets(causes, station)
+        if len(rejected) > max_rejected(len(of_first & of_other)):
+            refused |= rejected
+    return tuple(
+        cause for cause in causes if cause.kind is not CauseKind.SIGHT or cause.target not in refused
+    )
+
+
+def rejected_targets(causes: Collection[Cause], station: int) -> set[int]:
+    """Return the rows of the targets that a station, or the first one, measured wrong."""
+    return {
+        cause.target
+        for cause in causes
+        if cause.kind is CauseKind.SIGHT and cause.station in (0, station) and cause.target is not None
+    }
+
+
+def rejected_readings(readings: TargetReadings, causes: Collection[Cause]) -> NDArray[np.bool_]:
+    """Rows of the readings that causes of kind SIGHT leave out."""
+    rejected = np.zeros(len(readings.station), dtype=bool)
+    for cause in causes:
+        if cause.kind is CauseKind.SIGHT:
+            of_target = readings.target == cause.target
+            rejected |= of_target if cause.either_station else of_target & (readings.station == cause.station)
+    return rejected

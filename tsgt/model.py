@@ -459,6 +459,102 @@ ROBOT_ORIGIN = ReferencePoint()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ImuNoise(FiniteNumbers):
+    """One-sigma noise of an inertial measurement unit, per axis, in the form of its data sheet."""
+
+    gyro_noise_density: float
+    """White noise of the angular rate in rad/s/sqrt(Hz)."""
+    accelerometer_noise_density: float
+    """White noise of the specific force in m/s^2/sqrt(Hz)."""
+    gyro_bias_walk: float
+    """Random walk of the gyro's bias in rad/s/sqrt(s)."""
+    accelerometer_bias_walk: float
+    """Random walk of the accelerometer's bias in m/s^2/sqrt(s)."""
+    gyro_bias_radps: float
+    """Bias of the gyro after switching on, in rad/s."""
+    accelerometer_bias_mps2: float
+    """Bias of the accelerometer after switching on, in m/s^2."""
+
+    def __post_init__(self) -> None:
+        """Reject noise that no instrument has."""
+        for name in self.__slots__:
+            if not 0 < getattr(self, name) <= 1e3:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected more than 0 and at most 1000")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuParameters(FiniteNumbers):
+    """Parameters that put the samples of the robot's IMU beside the measurements of the stations."""
+
+    name: str = "imu"
+    """Name of its frame, whose pose may be exported."""
+    position_m: Vector3
+    """Origin of its axes (of its accelerometers) in the frame ``robot``, [x, y, z] in m."""
+    orientation_xyzw: Row4
+    """Rotation that takes coordinates in its axes to the frame ``robot``, as a Hamilton unit quaternion [x, y, z, w]."""
+    latency_ns: int = 0
+    """From a sample to its stamp, in ns; subtracted from the stamp. Positive: the stamp is late."""
+    gyro_matrix: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Scale factors and misalignment: the angular rate is this matrix times the sample, less the bias."""
+    noise: ImuNoise
+    """Noise of the samples."""
+    gravity_mps2: float = 9.81
+    """Magnitude of gravity where the robot drives, in m/s^2."""
+    tilt_sigma_rad: float = 1e-4
+    """One sigma, per horizontal axis, of the angle between the z axis of frame ``station1`` and the vertical."""
+
+    def __post_init__(self) -> None:
+        """Reject impossible parameters."""
+        _check_limits(
+            self,
+            latency_ns=(-(10**10), 10**10),
+            gravity_mps2=(9.7, 9.9),
+            tilt_sigma_rad=(0, 0.1),
+        )
+        _check_coordinates("position_m", self.position_m)
+        if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < _ROTATION_TOLERANCE:
+            raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuSamples:
+    """Consecutive samples of the robot's IMU, raw: each is the mean over an interval of time.
+
+    The lists have one entry per sample; they hold one line of the program that reads the IMU, about ten samples.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["imu"] = "imu"
+    sequence: int
+    """Number of the first sample; lost samples are counted."""
+    received_ns: int
+    """Arrival of the line on the master's Unix clock in ns."""
+    stamp_ns: tuple[int, ...]
+    """End of each sample's interval on the master's Unix clock in ns, by the fitted clock of the device."""
+    duration_ns: tuple[int, ...]
+    """Length of each interval in ns, by the clock or the counter of the device."""
+    instrument_time_ns: tuple[int, ...] | None
+    """End of each interval on the clock of the device in ns; null where it has none."""
+    angular_rate_radps: tuple[Vector3, ...]
+    """Mean angular rate in its own axes, [x, y, z] in rad/s."""
+    specific_force_mps2: tuple[Vector3, ...]
+    """Mean specific force in its own axes, [x, y, z] in m/s^2: about +9.81 along the axis that points up, at rest."""
+
+    def __post_init__(self) -> None:
+        """Reject lists of different length and impossible times."""
+        n = len(self.stamp_ns)
+        lists = (self.duration_ns, self.angular_rate_radps, self.specific_force_mps2)
+        if (
+            n == 0
+            or any(len(each) != n for each in lists)
+            or len(self.instrument_time_ns or self.stamp_ns) != n
+        ):
+            raise ValueError("the lists of a line have different lengths, or none has an entry")
+        check_instants(self.received_ns, *self.stamp_ns, *self.duration_ns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SetupCovariance(FiniteNumbers):
     """Joint covariance of the calibrated set-up, which all poses share: it does not average out over time."""
 
@@ -467,7 +563,9 @@ class SetupCovariance(FiniteNumbers):
     origin of station K in frame ``station1``, in m; ``stationK.rotation_x``, ``.rotation_y``, ``.rotation_z``: rotation of
     its axes about the fixed axes of frame ``station1`` through that origin, in rad; ``stationK.latency`` in s;
     ``stationK.vertical_index`` and ``.collimation`` in rad; ``stationK.prism_constant`` in m; ``stationK.range_scale``,
-    dimensionless; ``prismP.x``, ``.y``, ``.z``: in the frame ``robot``, in m."""
+    dimensionless; ``prismP.x``, ``.y``, ``.z``: in the frame ``robot``, in m; ``imu.x``, ``.y``, ``.z``: its origin in the frame ``robot``, in m;
+    ``imu.rotation_x``, ``.rotation_y``, ``.rotation_z``: rotation of its axes about those of ``robot``, in rad;
+    ``imu.latency`` in s; ``imu.gyro_11`` to ``imu.gyro_33``: entries of its gyro matrix."""
     matrix: tuple[tuple[float, ...], ...]
     """n rows of n: covariances in products of those units."""
 

@@ -10,7 +10,7 @@ from tsgt.geometry.motion_calibration import Setup, SetupParameters, calibrated_
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.motion_calibration import Hypothesis, RefinedSetup
+    from tsgt.geometry.motion_calibration import Hypothesis, HypothesisEvidence, HypothesisKind, RefinedSetup
     from tsgt.geometry.trajectory import Observations
     from tsgt.model import MotionPrior, Parameters
 
@@ -84,6 +84,50 @@ def refinement_text(refined: RefinedSetup | None, parameters: Parameters) -> str
     ]
     beyond = f", beyond its stated uncertainty: {', '.join(selected)}" if selected else ""
     return f"Set-up: refined within the trajectory{beyond}"
+
+
+def refinement_rows(refined: RefinedSetup | None, parameters: Parameters) -> tuple[tuple[str, ...], ...]:
+    """Return what may have been wrong, the most likely first: its name, estimates, log Bayes factor, and whether it was refined.
+
+    Each estimate is what follows if this alone was wrong, with one sigma. Empty where nothing was compared.
+    """
+    if refined is None:
+        return ()
+    return tuple(
+        (
+            f"{each.hypothesis.kind.replace('_', ' ')}, {_subject(each.hypothesis)} {_number(each.hypothesis, parameters)}",
+            _estimates(each),
+            f"{each.log_bayes_factor:.1f}",
+            "yes" if refined.used and each.selected else "no",
+        )
+        for each in sorted(refined.evidence, key=lambda each: -each.log_bayes_factor)
+    )
+
+
+def _estimates(evidence: HypothesisEvidence) -> str:
+    """Return the estimates of a hypothesis with one sigma, in the units of the field."""
+    kind = evidence.hypothesis.kind
+    parts = []
+    for name, value, sigma in zip(
+        evidence.hypothesis.components, evidence.estimate.tolist(), evidence.sigma.tolist(), strict=True
+    ):
+        factor, unit = _ROTATION if name.startswith("rotation") else _UNITS[kind]
+        digits = {"mm": 1, "ppm": 1, "ms": 2, "mrad": 3}[unit]
+        parts.append(f"{name} {factor * value:.{digits}f} ± {factor * sigma:.{digits}f} {unit}".strip())
+    return ", ".join(parts).replace("_", " ")
+
+
+_ROTATION = (1e3, "mrad")
+_UNITS: dict[HypothesisKind, tuple[float, str]] = {
+    "frame": (1e3, "mm"),
+    "turned": _ROTATION,
+    "latency": (1e3, "ms"),
+    "vertical_index": _ROTATION,
+    "collimation": _ROTATION,
+    "prism_constant": (1e3, "mm"),
+    "range_scale": (1e6, "ppm"),
+    "prism": (1e3, "mm"),
+}
 
 
 def _number(hypothesis: Hypothesis, parameters: Parameters) -> int:

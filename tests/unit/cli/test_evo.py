@@ -88,6 +88,15 @@ def test_evo_agrees_with_evaluate(
     assert relative_m == pytest.approx(over_1_m["position_rms_mm"] / 1e3, abs=1e-6)
 
 
+def test_relative_errors_are_printed(tsgt: Tsgt, recording: Path) -> None:
+    """A table of RPE over metres and a second."""
+    reference = recording.with_name("reference.tum")
+    assert tsgt("process", recording, "--output", reference).code == 0
+    printed = tsgt("evaluate", recording, "--reference", reference, "--no-held-out").out
+    assert "Relative pose errors (RPE)" in printed
+    assert "1 m, one after the other" in printed
+
+
 def test_reference_of_the_robot_is_carried_over(
     tsgt: Tsgt, recording: Path, evo_errors: Callable[[Path, Path], tuple[int, float, float, float]]
 ) -> None:

@@ -10,11 +10,21 @@ from tsgt.analysis.report.page import UNKNOWN, Section, Table, format_number, fo
 if TYPE_CHECKING:
     from tsgt.analysis.diagnosis import Diagnosis, Finding
 
+LISTED_HYPOTHESES = 10
+
 COMPONENTS = ("range", "horizontal_angle", "zenith_angle")
 
 
-def diagnosis_section(diagnosis: Diagnosis | None, problem: str | None, refinement: str = "") -> Section:
-    """Return the section on the causes of errors; ``problem``: why they are unknown, ``refinement``: what was refined."""
+def diagnosis_section(
+    diagnosis: Diagnosis | None,
+    problem: str | None,
+    refinement: str = "",
+    refined: tuple[tuple[str, ...], ...] = (),
+) -> Section:
+    """Return the section on the causes of errors.
+
+    ``problem``: why they are unknown; ``refinement``, ``refined``: what of the set-up was refined, in words and as rows.
+    """
     title = "Causes of errors"
     if diagnosis is None:
         return Section(title, (f"Unknown: {problem or 'there is no continuous trajectory'}.",))
@@ -45,6 +55,14 @@ def diagnosis_section(diagnosis: Diagnosis | None, problem: str | None, refineme
         rows = tuple((part.name, str(part.n), format_number(part.ratio, 2)) for part in diagnosis.held_out)
         caption = "Mean prediction error of left-out measurements by the estimator continuous, relative to linear (below 1: better)"
         tables.append(Table(caption, ("part of the drive", "measurements", "ratio"), rows))
+    if refined:
+        caption = (
+            "What may be wrong in the set-up: each estimate as if it alone were, with one sigma; the log Bayes factor is the "
+            "evidence for it against the set-up as recorded (above 5: very strong)"
+        )
+        tables.append(
+            Table(caption, ("what", "estimate", "log Bayes factor", "refined"), refined[:LISTED_HYPOTHESES])
+        )
     return Section(title, (text, *filter(None, [refinement])), tuple(tables))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.figures import TimeAxis, panels_height_mm
-from tsgt.analysis.refinement import refinement_text
+from tsgt.analysis.refinement import refinement_rows, refinement_text
 from tsgt.analysis.report import station_figures as draw
 from tsgt.analysis.report.calibration import calibration_section
 from tsgt.analysis.report.diagnosis_section import diagnosis_section
@@ -40,7 +40,7 @@ def sections(f: Findings) -> list[Section]:
     """Return all sections in their order: those that help most to decide come first."""
     axis = TimeAxis.over(f.start_ns, f.end_ns)
     found = (
-        diagnosis_section(f.diagnosis, f.problems.get("diagnosis"), _refinement(f)),
+        diagnosis_section(f.diagnosis, f.problems.get("diagnosis"), *_refinement(f)),
         reference_section(f, axis),
         pose_section(f, axis),
         live_section(f.live, f.point),
@@ -57,11 +57,12 @@ def sections(f: Findings) -> list[Section]:
     return [section for section in found if section is not None]
 
 
-def _refinement(f: Findings) -> str:
-    """Return what of the set-up was refined within the trajectory."""
+def _refinement(f: Findings) -> tuple[str, tuple[tuple[str, ...], ...]]:
+    """Return what of the set-up was refined within the trajectory, in words and as rows of a table."""
     if f.continuous is None:
-        return ""
-    return f"{refinement_text(f.continuous.refinement, f.continuous.parameters)}."
+        return "", ()
+    refined, parameters = f.continuous.refinement, f.continuous.parameters
+    return f"{refinement_text(refined, parameters)}.", refinement_rows(refined, parameters)
 
 
 def _recording(f: Findings) -> Section:

@@ -169,6 +169,32 @@ def print_comparisons(
     if rows:
         click.echo(f"\nMean pose of each stop, unaligned: mean and maximum error; {at}")
         print_table(["estimator", "n", *of_points("mean", "max"), "mean deg", "max deg"], rows)
+    rows = [
+        [
+            name,
+            f"{each.delta:g} {each.unit}, {'one after the other' if each.pairs == 'consecutive' else 'all'}",
+            str(each.errors.n),
+            *numbers(
+                each.errors.position_mm.rms, each.errors.position_mm.median, each.errors.position_mm.max
+            ),
+            *numbers(each.errors.orientation_deg.rms, digits=3),
+        ]
+        for name, comparison in found.items()
+        for each in comparison.details.rpe
+        if each.errors.n
+    ]
+    if rows:
+        click.echo(f"\nRelative pose errors (RPE) of pairs of poses, at {point_label(point)}")
+        print_table(
+            [
+                "estimator",
+                "pairs",
+                "n",
+                *(f"{point.name} {each} mm" for each in ("rms", "median", "max")),
+                "rms deg",
+            ],
+            rows,
+        )
 
 
 def _span(stamp_ns: np.ndarray[Any, np.dtype[np.int64]]) -> str:

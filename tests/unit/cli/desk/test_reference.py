@@ -75,8 +75,9 @@ def test_every_table_of_errors_names_its_points(tsgt: Tsgt, recording: Path, tmp
     assert tsgt("process", recording, "--estimator", "linear", "--output", reference).code == 0
     arguments = ("--no-held-out", "--reference", reference, "--align", "rigid", "--point", "lidar=1,2,3")
     text = tsgt("evaluate", recording, *arguments).out
-    titles, headers = zip(*(table.strip().splitlines()[:2] for table in text.split("\n\n")[-2:]), strict=True)
-    assert all("positions at lidar and at the prisms' centroid" in title for title in titles)
+    titles, headers = zip(*(table.strip().splitlines()[:2] for table in text.split("\n\n")[-3:]), strict=True)
+    assert all("positions at lidar and at the prisms' centroid" in title for title in titles[:2])
+    assert "of pairs of poses, at lidar" in titles[2]
     for header in headers:
         columns = [column for column in re.split(r"  +", header) if " mm" in column and column != "shift mm"]
         assert len(columns) >= 2

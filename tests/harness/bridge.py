@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tsgt.clock import Clock
+    from tsgt.service import Listener
     from tsgt.station import Instrument, Reading
-    from tsgt.station.bridge.process import Listener
 
 HELLO = {"type": "hello", "bridge": 1, "make": "Fake", "stamps": "host"}
 COMMANDS = ["track", "direct", "measure", "atmosphere"]

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
+from tsgt.service import LineSplitter, RejectedLines
 from tsgt.simulation.kernel import VirtualClock, run_virtual
-from tsgt.station.bridge.messages import LineSplitter
-from tsgt.station.bridge.session import BridgeSession, RejectedLines
+from tsgt.station.bridge.session import BridgeSession
 from tsgt.station.bridge.timing import MAX_AGE_NS, LineTimestamper
 
 if TYPE_CHECKING:
@@ -60,7 +60,9 @@ def test_readings_are_plausible(
 
     async def main() -> None:
         clock = VirtualClock(0)
-        run = BridgeSession("bridge", clock, LineTimestamper(0), readings, RejectedLines(clock))
+        run = BridgeSession(
+            "bridge", clock, LineTimestamper(0), readings, RejectedLines(clock, lambda *_: None)
+        )
         now_ns = 20 * 10**9
         run.output_received(json.dumps(HELLO | {"stamps": stamps}).encode() + b"\n", now_ns)
         run.set_tracking(1)
@@ -110,7 +112,9 @@ def test_damaged_output_gives_plausible_readings(damage: Damage, cuts: list[int]
 
     async def main() -> None:
         clock = VirtualClock(0)
-        run = BridgeSession("bridge", clock, LineTimestamper(0), readings, RejectedLines(clock))
+        run = BridgeSession(
+            "bridge", clock, LineTimestamper(0), readings, RejectedLines(clock, lambda *_: None)
+        )
         now_ns = 20 * 10**9
         run.set_tracking(1)
         for begin, end in pairwise(sorted({0, len(output), *(cut for cut in cuts if cut < len(output))})):

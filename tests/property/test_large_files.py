@@ -14,7 +14,7 @@ from tsgt.analysis.formats import read_pos, read_stationary_intervals, read_targ
 from tsgt.config import load_any
 from tsgt.errors import ConfigError, InputFileError, RecordingError
 from tsgt.recording import MAX_LINE_BYTES, load_recording
-from tsgt.station.bridge.messages import LineSplitter
+from tsgt.service import LineSplitter
 
 if TYPE_CHECKING:
     from collections.abc import Callable

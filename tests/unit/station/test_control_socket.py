@@ -193,7 +193,7 @@ async def test_full_disk_is_reported_with_waiting_and_lost_lines(
     monkeypatch.setattr(RecordingWriter, "write_line", write_if_room)
     monkeypatch.setattr(Recorder.__init__, "__kwdefaults__", {"max_pending_lines": 10})
     notified: list[str] = []
-    monkeypatch.setattr("tsgt.service.sd_notify", lambda *assignments: notified.extend(assignments))
+    monkeypatch.setattr("tsgt.service.daemon.sd_notify", lambda *assignments: notified.extend(assignments))
     async with client(tmp_path) as instrument:
         full = True
         for _ in range(15):

@@ -10,9 +10,12 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING
 
+import structlog
+
 from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.recording import encode_line
 from tsgt.recording.journal import InstrumentRecord
+from tsgt.service import RejectedLines, printable, start_process
 from tsgt.station.bridge.messages import (
     AtmosphereLine,
     CommandLine,
@@ -22,10 +25,8 @@ from tsgt.station.bridge.messages import (
     MeasureLine,
     SingleMeasurementLine,
     TrackLine,
-    printable,
 )
-from tsgt.station.bridge.process import start_process
-from tsgt.station.bridge.session import BridgeSession, RejectedLines, reading_of
+from tsgt.station.bridge.session import BridgeSession, reading_of
 from tsgt.station.bridge.timing import LineTimestamper
 from tsgt.station.instrument import Condition
 
@@ -33,12 +34,14 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.config import BridgeInstrumentConfig
     from tsgt.radio import Direction
-    from tsgt.station.bridge.process import Program, StartProgram
+    from tsgt.service import Program, StartProgram
     from tsgt.station.instrument import Atmosphere, Reading
 
 HELLO_TIMEOUT_S = 30.0  # time for a silent program to find its instrument; each usable line restarts it
 
 RESPONSE_TIMEOUT_S = 30.0  # time for any command; a two-face measurement of a target takes 15 s
+
+log = structlog.get_logger()
 
 
 class BridgeInstrument:
@@ -50,14 +53,16 @@ class BridgeInstrument:
         self._config = config
         self._name = config.command[0]
         self._clock = clock
-        self._start = start or partial(start_process, clock=clock)
+        self._start = start or partial(
+            start_process, clock=clock, setting="instrument.command", log_stderr=_log_stderr
+        )
         self._latency_ns = round(config.latency_ms * 1e6)
         self._timestamper = LineTimestamper(self._latency_ns)
         self._readings: deque[Reading] = deque()
         self._session: BridgeSession | None = None
         self._program: Program | None = None
         self._last_id = 0
-        self._rejected = RejectedLines(clock)
+        self._rejected = RejectedLines(clock, _log_rejected)
 
     async def connect(self) -> str:
         """Terminate an earlier program, start the program, and wait for its hello."""
@@ -226,3 +231,11 @@ class BridgeInstrument:
         if hello is None:
             raise InstrumentError(f"{self._name}: not connected; call connect first")
         return hello
+
+
+def _log_stderr(text: str, dropped: int) -> None:
+    log.info("bridge_stderr", text=text, dropped=dropped)
+
+
+def _log_rejected(error: str, line: str, rejected: int) -> None:
+    log.warning("bridge_line_rejected", error=error, line=line, rejected=rejected)

@@ -19,8 +19,6 @@ FORMAT_VERSION = 1  # changes when a client of the old version would misundersta
 
 MAX_LINE_BYTES = 16_384  # longer lines are truncated; a measurement takes 300 bytes
 
-MAX_TEXT = 200  # longer texts are truncated
-
 MAX_DISTANCE_M = 20_000.0  # beyond the range of any total station: a larger number is in mm, or invalid
 
 TimestampSource = Literal["host", "instrument", "arrival"]
@@ -219,24 +217,3 @@ def response_id(data: bytes) -> int | None:
         return decode(_Identified, data).id if is_response else None
     except ValueError:
         return None
-
-
-def printable(text: str) -> str:
-    """Return text from outside as one truncated line without control characters."""
-    return "".join(sign if sign.isprintable() else " " for sign in text[:MAX_TEXT]).strip()
-
-
-class LineSplitter:
-    """Splits output into lines, truncated to ``limit_bytes``; a truncated line is invalid JSON and rejected as such."""
-
-    def __init__(self, limit_bytes: int = MAX_LINE_BYTES) -> None:
-        self._limit_bytes = limit_bytes
-        self._partial = b""
-
-    def push(self, data: bytes) -> list[bytes]:
-        """Add data; return the lines completed by it, without line ends and empty lines."""
-        first, *others = data.split(b"\n")
-        lines = [self._partial + first[: self._limit_bytes - len(self._partial)]]
-        lines += [line[: self._limit_bytes] for line in others]
-        self._partial = lines.pop()
-        return [line for line in lines if line.strip()]

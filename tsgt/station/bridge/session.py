@@ -8,31 +8,29 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-import structlog
-
 from tsgt.errors import InstrumentError
+from tsgt.service import LineSplitter
 from tsgt.station.bridge.messages import (
+    MAX_LINE_BYTES,
     BridgeVersionError,
     DoneLine,
     HelloLine,
-    LineSplitter,
     MeasurementLine,
     ProgramLine,
     SettingsLine,
     SingleMeasurementLine,
     StatusLine,
     decode_program_line,
-    printable,
     response_id,
 )
 from tsgt.station.instrument import Reading
-from tsgt.station.log_limiter import LogLimiter
 
 if TYPE_CHECKING:
     from collections import deque
     from collections.abc import Callable
 
     from tsgt.clock import Clock
+    from tsgt.service import RejectedLines
     from tsgt.station.bridge.timing import LineTimestamper
 
 MAX_LINES_PER_S = 1000
@@ -42,13 +40,9 @@ _BYTES_PER_LINE = 1000  # this many bytes count as a line, so that a line withou
 
 READING_QUEUE_CAPACITY = 1000
 
-LOGGED_LINE_BYTES = 120
-
-log = structlog.get_logger()
-
 
 class BridgeSession:
-    """The session with one run of the program; a :class:`~tsgt.station.bridge.process.Listener`.
+    """The session with one run of the program; a :class:`~tsgt.service.Listener`.
 
     Attributes
     ----------
@@ -81,7 +75,7 @@ class BridgeSession:
         self._timestamper = timestamper
         self._readings = readings
         self._rejected = rejected
-        self._splitter = LineSplitter()
+        self._splitter = LineSplitter(MAX_LINE_BYTES)
         self._changed = asyncio.Event()
         self._pending: tuple[int, int | None] | None = (
             None  # id of the command, and the prism tracked after it
@@ -228,24 +222,6 @@ class BridgeSession:
             else:
                 self._readings.append(reading_of(each.line, each.prism, each.at_ns, each.received_ns))
                 self._rejected.last = ""
-
-
-class RejectedLines:
-    """Counts and logs rejected lines. ``last``: what was wrong with the last one; empty since the last measurement."""
-
-    def __init__(self, clock: Clock) -> None:
-        self._clock = clock
-        self._count = 0
-        self._log_limiter = LogLimiter()
-        self.last = ""
-
-    def add(self, reason: str, line: bytes) -> None:
-        """Count a line, and log it once a minute at most."""
-        self._count += 1
-        self.last = f"a line of the program was rejected: {printable(reason)}"
-        if self._log_limiter.allows("bridge_line_rejected", self._clock.monotonic_ns()):
-            shown = printable(line[:LOGGED_LINE_BYTES].decode(errors="replace"))
-            log.warning("bridge_line_rejected", error=printable(reason), line=shown, rejected=self._count)
 
 
 def reading_of(

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from tsgt.service import LogLimiter
 from tsgt.station.geocom import Rpc
 from tsgt.station.leica.identity import numeric_values
 from tsgt.station.leica.measurement import MAX_TIME_MS, Timestamp
-from tsgt.station.log_limiter import LogLimiter
 from tsgt.timesync import InstrumentClock
 
 if TYPE_CHECKING:

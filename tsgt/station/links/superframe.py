@@ -9,9 +9,9 @@ import structlog
 from tsgt.radio.superframe import SendQueue, SuperframeStation
 from tsgt.radio.superframe.wire import Authenticator, angle_code
 from tsgt.recording.journal import AcknowledgedRecord, ReceptionRecord
+from tsgt.service import LogLimiter
 from tsgt.station.backlog import queued_measurement
 from tsgt.station.links.traffic_monitor import UnknownTrafficMonitor
-from tsgt.station.log_limiter import LogLimiter
 from tsgt.station.status import LinkStatus
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""A bridge program as a child process: passes its output on as it arrives, and its stderr to the log."""
+"""A program as a child process: passes its output on as it arrives, and its stderr to the log."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Protocol
 
-import structlog
-
 from tsgt.errors import InstrumentError
-from tsgt.station.bridge.messages import LineSplitter, printable
+from tsgt.service.program_lines import LineSplitter, printable
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
 
-END_TIMEOUT_S = 0.3  # time from SIGTERM to SIGKILL; the client itself must end within a second
+END_TIMEOUT_S = 0.3  # time from SIGTERM to SIGKILL; the daemon itself must end within a second
 
 KILL_TIMEOUT_S = 0.1  # how long to wait for the end of a killed program
 
@@ -26,7 +24,10 @@ OUTPUT_DRAIN_S = 0.2
 
 STDERR_LINES_PER_S = 20  # further lines are counted, and not logged
 
-log = structlog.get_logger()
+MAX_STDERR_LINE_BYTES = 16_384
+
+LogStderr = Callable[[str, int], None]
+"""Logs a line of a program's stderr; also takes the number of lines that were not logged so far."""
 
 
 class Listener(Protocol):
@@ -56,18 +57,23 @@ StartProgram = Callable[[Sequence[str], Listener], Coroutine[Any, Any, Program]]
 """Starts a program with its arguments; raises InstrumentError."""
 
 
-async def start_process(command: Sequence[str], listener: Listener, clock: Clock) -> Program:
-    """Start a child process in a session of its own, which Ctrl-C does not reach; raises InstrumentError on failure."""
+async def start_process(
+    command: Sequence[str], listener: Listener, clock: Clock, *, setting: str, log_stderr: LogStderr
+) -> Program:
+    """Start a child process in a session of its own, which Ctrl-C does not reach; raises InstrumentError on failure.
+
+    ``setting``: key of the command in the configuration, for the error.
+    """
     environment = dict(os.environ)
     environment.pop("NOTIFY_SOCKET", None)  # it must not notify systemd on behalf of the service
     try:
         _, process = await asyncio.get_running_loop().subprocess_exec(
-            lambda: _Process(listener, clock), *command, env=environment, start_new_session=True
+            lambda: _Process(listener, clock, log_stderr), *command, env=environment, start_new_session=True
         )
     except (OSError, ValueError) as error:  # ValueError: a zero byte among the arguments
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise InstrumentError(
-            f"{command[0]}: cannot be started ({reason}); check instrument.command in the configuration"
+            f"{command[0]}: cannot be started ({reason}); check {setting} in the configuration"
         ) from error
     return process
 
@@ -77,12 +83,12 @@ class _Process(asyncio.SubprocessProtocol):
 
     _transport: asyncio.SubprocessTransport
 
-    def __init__(self, listener: Listener, clock: Clock) -> None:
+    def __init__(self, listener: Listener, clock: Clock, log_stderr: LogStderr) -> None:
         self._listener = listener
         self._clock = clock
         self._exited = asyncio.Event()
         self._reported = False
-        self._stderr = _Stderr(clock)
+        self._stderr = _Stderr(clock, log_stderr)
 
     # --- Program ----------------------------------------------------------------------------------------------
 
@@ -163,9 +169,10 @@ class _Process(asyncio.SubprocessProtocol):
 class _Stderr:
     """Logs a program's stderr, up to a rate; ``last`` is the last line."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock, log_stderr: LogStderr) -> None:
         self._clock = clock
-        self._splitter = LineSplitter()
+        self._log_stderr = log_stderr
+        self._splitter = LineSplitter(MAX_STDERR_LINE_BYTES)
         self._second = -1
         self._logged = 0
         self._dropped = 0
@@ -182,4 +189,4 @@ class _Stderr:
                 self._dropped += 1
                 continue
             self._logged += 1
-            log.info("bridge_stderr", text=self.last, dropped=self._dropped)
+            self._log_stderr(self.last, self._dropped)

@@ -1,4 +1,4 @@
-"""Services to a daemon: orderly shutdown, systemd notifications, periodic sync to disk, and exclusive UNIX sockets."""
+"""Orderly shutdown, systemd notifications, periodic sync to disk, and exclusive UNIX sockets."""
 
 from __future__ import annotations
 

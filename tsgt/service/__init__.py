@@ -1,0 +1,38 @@
+"""Services to a daemon: orderly shutdown, systemd, periodic sync to disk, UNIX sockets, and supervised programs.
+
+`daemon` are the first ones; `program` runs a child process that prints lines, which `program_lines` splits and rejects;
+`log_limiter` limits warnings that could be logged with every line or packet.
+"""
+
+from tsgt.service.daemon import (
+    MAX_SOCKET_PATH_BYTES,
+    UnixListener,
+    notify_systemd,
+    run,
+    sd_notify,
+    sync_periodically,
+    watchdog_interval_s,
+)
+from tsgt.service.log_limiter import LogLimiter
+from tsgt.service.program import END_TIMEOUT_S, Listener, LogStderr, Program, StartProgram, start_process
+from tsgt.service.program_lines import LineSplitter, RejectedLines, printable
+
+__all__ = [
+    "END_TIMEOUT_S",
+    "MAX_SOCKET_PATH_BYTES",
+    "LineSplitter",
+    "Listener",
+    "LogLimiter",
+    "LogStderr",
+    "Program",
+    "RejectedLines",
+    "StartProgram",
+    "UnixListener",
+    "notify_systemd",
+    "printable",
+    "run",
+    "sd_notify",
+    "start_process",
+    "sync_periodically",
+    "watchdog_interval_s",
+]

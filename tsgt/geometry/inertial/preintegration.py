@@ -1,0 +1,292 @@
+"""Preintegration of inertial samples between two times, of many intervals at once. Sans-I/O.
+
+The samples of an interval become one relative motion with its covariance and its Jacobians by the biases, so that an
+optimiser that moves the states does not integrate again (C. Forster et al., "On-manifold preintegration for real-time
+visual-inertial odometry", IEEE T-RO 33(1), 2017). Here every sum over samples is a product of matrices: the only recursion is
+the product of the rotations. docs/explanation/imu.md derives the sums.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.rigid import IDENTITY, FloatArray, cross, exp_and_right_jacobian, exp_so3, matvec, skew
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.inertial.samples import InertialSamples
+    from tsgt.model import ImuNoise
+
+GAP_ANGULAR_RATE_SIGMA_RADPS = 0.5
+GAP_SPECIFIC_FORCE_SIGMA_MPS2 = 2.0
+"""One sigma of the mean motion while samples are missing, about the mean of the samples before and after."""
+
+_MAX_GAP_SHARE = (
+    0.5  # Of a sample's duration: a sample that begins later than this after the one before leaves a gap
+)
+_PARTS_PER_CHUNK = 4096  # Samples that are integrated in one pass; their matrices stay in the cache
+
+
+@dataclass(frozen=True, slots=True)
+class ContiguousSamples:
+    """N samples without gaps: each covers the time from its own bound to the next; missing ones are filled in."""
+
+    bounds_s: FloatArray  # (N + 1,) strictly increasing
+    angular_rate_radps: FloatArray  # (N, 3) mean over the sample, in the axes of the IMU
+    specific_force_mps2: FloatArray  # (N, 3)
+    gyro_density: FloatArray  # (N,) square root of the noise's power spectral density, rad/s/sqrt(Hz)
+    accelerometer_density: FloatArray  # (N,) m/s^2/sqrt(Hz)
+    missing: NDArray[np.bool_]  # (N,) filled in
+
+    def __len__(self) -> int:
+        return len(self.angular_rate_radps)
+
+    def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Angular rate and specific force at M instants, (M, 3) each: linear between the middles of the samples."""
+        middle_s = 0.5 * (self.bounds_s[:-1] + self.bounds_s[1:])
+        later = np.clip(np.searchsorted(middle_s, time_s), 1, max(len(self) - 1, 1))
+        earlier, later = later - 1, np.minimum(later, len(self) - 1)
+        step_s = np.where(later > earlier, middle_s[later] - middle_s[earlier], 1.0)
+        share = np.clip((time_s - middle_s[earlier]) / step_s, 0.0, 1.0)[:, None]
+        rate, force = (
+            values[earlier] + share * (values[later] - values[earlier])
+            for values in (self.angular_rate_radps, self.specific_force_mps2)
+        )
+        return rate, force
+
+
+def contiguous(
+    samples: InertialSamples, noise: ImuNoise, *, start_s: float | None = None, end_s: float | None = None
+) -> ContiguousSamples:
+    """Fill the gaps between samples, at least one, and those before ``start_s`` and after ``end_s`` if there are any.
+
+    A sample's increments of angle and velocity are those over its own duration; they are taken to be spread over the time
+    since the sample before, so that jitter of the times neither adds nor loses motion.
+    """
+    begin_s = samples.end_s - samples.duration_s
+    previous_s = np.concatenate([begin_s[:1], samples.end_s[:-1]])
+    gap = begin_s - previous_s > _MAX_GAP_SHARE * samples.duration_s
+    covered_s = np.where(gap, samples.duration_s, samples.end_s - previous_s)
+    scale = (samples.duration_s / covered_s)[:, None]
+    rate, force = samples.angular_rate_radps * scale, samples.specific_force_mps2 * scale
+    before = np.flatnonzero(gap)
+    ends_s = np.insert(samples.end_s, before, begin_s[before])
+    missing = np.insert(np.zeros(len(samples), np.bool_), before, True)
+    rate, force = (
+        np.insert(each, before, 0.5 * (each[before - 1] + each[before]), axis=0) for each in (rate, force)
+    )
+    bounds_s = np.concatenate([begin_s[:1], ends_s])
+    if start_s is not None and start_s < bounds_s[0]:
+        bounds_s, missing = np.insert(bounds_s, 0, start_s), np.insert(missing, 0, True)
+        rate, force = np.concatenate([rate[:1], rate]), np.concatenate([force[:1], force])
+    if end_s is not None and end_s > bounds_s[-1]:
+        bounds_s, missing = np.append(bounds_s, end_s), np.append(missing, True)
+        rate, force = np.concatenate([rate, rate[-1:]]), np.concatenate([force, force[-1:]])
+    root_s = np.sqrt(np.diff(bounds_s))
+    return ContiguousSamples(
+        bounds_s,
+        rate,
+        force,
+        np.where(missing, GAP_ANGULAR_RATE_SIGMA_RADPS * root_s, noise.gyro_noise_density),
+        np.where(missing, GAP_SPECIFIC_FORCE_SIGMA_MPS2 * root_s, noise.accelerometer_noise_density),
+        missing,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Preintegrated:
+    """Relative motions over K intervals, in the axes of the IMU at each interval's start, without gravity.
+
+    The error has 9 components, three each of: position, rotation (about the axes at the end, ``R Exp(d)``), velocity.
+    """
+
+    duration_s: FloatArray  # (K,)
+    position: FloatArray  # (K, 3) double integral of the specific force, m
+    rotation: FloatArray  # (K, 3, 3) ``R_start_end``
+    velocity: FloatArray  # (K, 3) integral of the specific force, m/s
+    covariance: FloatArray  # (K, 9, 9)
+    by_gyro_bias: FloatArray  # (K, 9, 3) Jacobian of the error
+    by_accelerometer_bias: FloatArray  # (K, 9, 3)
+    gyro_bias: FloatArray  # (K, 3) bias that was subtracted, rad/s
+    accelerometer_bias: FloatArray  # (K, 3) m/s^2
+    missing_s: FloatArray  # (K,) time without samples
+
+    def __len__(self) -> int:
+        return len(self.duration_s)
+
+    def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Preintegrated:
+        """Return the motions over some intervals."""
+        return Preintegrated(*(getattr(self, each.name)[rows] for each in fields(self)))
+
+    def corrected(
+        self, gyro_bias: FloatArray, accelerometer_bias: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Position, rotation and velocity with other biases, (K, 3) each, to first order."""
+        error = matvec(self.by_gyro_bias, gyro_bias - self.gyro_bias)
+        error += matvec(self.by_accelerometer_bias, accelerometer_bias - self.accelerometer_bias)
+        return (
+            self.position + error[:, 0:3],
+            self.rotation @ exp_so3(error[:, 3:6]),
+            self.velocity + error[:, 6:9],
+        )
+
+
+def concatenate_preintegrated(parts: list[Preintegrated]) -> Preintegrated:
+    """Join motions in the given order."""
+    return Preintegrated(
+        *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Preintegrated))
+    )
+
+
+def preintegrate(
+    samples: ContiguousSamples,
+    start_s: FloatArray,
+    end_s: FloatArray,
+    gyro_bias: FloatArray,
+    accelerometer_bias: FloatArray,
+) -> Preintegrated:
+    """Preintegrate K intervals, in the order of time, from ``start_s`` to ``end_s``, (K,), within the samples' bounds.
+
+    Samples are cut at the ends of an interval: rate and force are constant within each. Biases, (K, 3) or (3,), are
+    subtracted.
+    """
+    count = len(start_s)
+    biases = np.concatenate(
+        [np.broadcast_to(gyro_bias, (count, 3)), np.broadcast_to(accelerometer_bias, (count, 3))], axis=1
+    )
+    first = np.clip(np.searchsorted(samples.bounds_s, start_s, side="right") - 1, 0, len(samples) - 1)
+    stop = np.clip(np.searchsorted(samples.bounds_s, end_s, side="left"), first + 1, len(samples))
+    size = stop - first
+    parts = []
+    begin = 0
+    while begin < count:
+        # Intervals of one chunk are padded to the longest.
+        longest = np.maximum.accumulate(size[begin : begin + _PARTS_PER_CHUNK])
+        fitting = int(np.count_nonzero(longest * np.arange(1, len(longest) + 1) <= _PARTS_PER_CHUNK))
+        rows = slice(begin, begin + max(fitting, 1))
+        parts.append(_integrate(samples, start_s[rows], end_s[rows], first[rows], size[rows], biases[rows]))
+        begin = rows.stop
+    return parts[0] if len(parts) == 1 else concatenate_preintegrated(parts)
+
+
+def _integrate(
+    samples: ContiguousSamples,
+    start_s: FloatArray,
+    end_s: FloatArray,
+    first: NDArray[np.intp],
+    size: NDArray[np.intp],
+    biases: FloatArray,
+) -> Preintegrated:
+    """Preintegrate intervals of at most S samples, ``size`` from ``first`` on; padding has zero duration."""
+    count, longest = len(size), int(size.max())
+    step = np.arange(longest)
+    index = np.minimum(first[:, None] + step, (first + size - 1)[:, None])
+    edges_s = np.empty((count, longest + 1))
+    edges_s[:, 0] = start_s
+    np.minimum(samples.bounds_s[index + 1], end_s[:, None], out=edges_s[:, 1:])
+    edges_s[:, -1] = end_s
+    dt_s = edges_s[:, 1:] - edges_s[:, :-1]
+    remaining_s = end_s[:, None] - 0.5 * (edges_s[:, 1:] + edges_s[:, :-1])
+    force = samples.specific_force_mps2[index] - biases[:, None, 3:]
+    angle = (samples.angular_rate_radps[index] - biases[:, None, :3]) * dt_s[..., None]
+    delta_R, J_r = exp_and_right_jacobian(angle)
+    rotation = np.empty((count, longest + 1, 3, 3))
+    rotation[:, 0] = IDENTITY
+    for i in range(longest):
+        np.matmul(rotation[:, i], delta_R[:, i], out=rotation[:, i + 1])
+    end_rotation_T = np.swapaxes(rotation[:, -1], 1, 2)
+    # Integral of the rotation over each sample, from the axes during it to those at the start: the transpose of the right
+    # Jacobian is the left one. It takes the force to an increment of velocity, and a bias to an error of rotation.
+    integral = rotation[:, :-1] @ np.swapaxes(J_r, 2, 3)
+    integral *= dt_s[..., None, None]
+    increment = matvec(integral, force)
+    # The increment's mean time is a little off the middle of the sample, for it turns meanwhile.
+    sculling = matvec(integral, cross(angle, force)) * (dt_s / 12)[..., None]
+    moments = increment * remaining_s[..., None]
+    # An error of rotation in sample i, in the axes at the start, acts on all later increments, and half on its own.
+    lever = np.concatenate([increment, moments], axis=2)
+    total = lever.sum(axis=1)
+    lever = total[:, None] - np.cumsum(lever, axis=1) + 0.5 * lever
+
+    weights = np.empty((count, longest, 8))
+    weights[..., 0], weights[..., 1], weights[..., 2:] = 1.0, remaining_s, lever
+    sums = (np.swapaxes(weights, 1, 2) @ integral.reshape(count, longest, 9)).reshape(count, 8, 3, 3)
+    by_gyro_bias, by_accelerometer_bias = np.empty((count, 9, 3)), np.zeros((count, 9, 3))
+    by_accelerometer_bias[:, 0:3], by_accelerometer_bias[:, 6:9] = -sums[:, 1], -sums[:, 0]
+    by_gyro_bias[:, 0:3], by_gyro_bias[:, 6:9] = _sum_of_crosses(sums[:, 5:8]), _sum_of_crosses(sums[:, 2:5])
+    by_gyro_bias[:, 3:6] = -end_rotation_T @ sums[:, 0]
+
+    gyro_variance = samples.gyro_density[index] ** 2 * dt_s
+    force_variance = samples.accelerometer_density[index] ** 2 * dt_s
+    return Preintegrated(
+        end_s - start_s,
+        total[:, 3:] - sculling.sum(axis=1),
+        rotation[:, -1].copy(),
+        total[:, :3].copy(),
+        _covariance(lever, end_rotation_T, gyro_variance, force_variance, dt_s, remaining_s),
+        by_gyro_bias,
+        by_accelerometer_bias,
+        biases[:, :3],
+        biases[:, 3:],
+        (dt_s * samples.missing[index]).sum(axis=1),
+    )
+
+
+def _sum_of_crosses(products: FloatArray) -> FloatArray:
+    """Sum of ``skew(a) @ M``, (K, 3, 3), from the sum of the products ``a_i M_jk``, (K, 3, 3, 3)."""
+    crosses: FloatArray = np.stack(
+        [
+            products[:, 1, 2] - products[:, 2, 1],
+            products[:, 2, 0] - products[:, 0, 2],
+            products[:, 0, 1] - products[:, 1, 0],
+        ],
+        axis=1,
+    )
+    return crosses
+
+
+def _covariance(
+    lever: FloatArray,
+    end_rotation_T: FloatArray,
+    gyro_variance: FloatArray,
+    force_variance: FloatArray,
+    dt_s: FloatArray,
+    remaining_s: FloatArray,
+) -> FloatArray:
+    """(K, 9, 9) of white noise, whose variance of angle and velocity per sample is given, (K, S).
+
+    The error of rotation n_i, isotropic, moves the velocity by ``-skew(lever_i) n_i``, and the products of skew-symmetric
+    matrices are ``skew(a) skew(b)^T = (a . b) I - b a^T``.
+    """
+    covariance = np.zeros((len(lever), 9, 9))
+    weighted = lever * gyro_variance[..., None]
+    moments = np.swapaxes(weighted, 1, 2) @ lever
+    sums = weighted.sum(axis=1)
+    position, rotation, velocity = slice(0, 3), slice(3, 6), slice(6, 9)
+    of_position, of_velocity = slice(3, 6), slice(0, 3)
+    for rows, columns, a, b in (
+        (position, position, of_position, of_position),
+        (position, velocity, of_position, of_velocity),
+        (velocity, velocity, of_velocity, of_velocity),
+    ):
+        product = moments[:, a, b]
+        trace = product[:, 0, 0] + product[:, 1, 1] + product[:, 2, 2]
+        covariance[:, rows, columns] = trace[:, None, None] * IDENTITY - np.swapaxes(product, 1, 2)
+    covariance[:, rotation, rotation] = gyro_variance.sum(axis=1)[:, None, None] * IDENTITY
+    # The transpose of ``-skew(lever)`` is ``skew(lever)``.
+    covariance[:, rotation, position] = end_rotation_T @ skew(sums[:, of_position])
+    covariance[:, rotation, velocity] = end_rotation_T @ skew(sums[:, of_velocity])
+    for rows, columns, variance in (
+        (position, position, (force_variance * (remaining_s**2 + dt_s**2 / 12)).sum(axis=1)),
+        (position, velocity, (force_variance * remaining_s).sum(axis=1)),
+        (velocity, velocity, force_variance.sum(axis=1)),
+    ):
+        np.einsum("kii->ki", covariance[:, rows, columns])[...] += variance[:, None]
+    covariance[:, position, rotation] = np.swapaxes(covariance[:, rotation, position], 1, 2)
+    covariance[:, velocity, rotation] = np.swapaxes(covariance[:, rotation, velocity], 1, 2)
+    covariance[:, velocity, position] = np.swapaxes(covariance[:, position, velocity], 1, 2)
+    return covariance

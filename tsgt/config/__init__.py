@@ -65,6 +65,7 @@ from tsgt.config.scenario import (
     ScenarioRadioConfig,
     SimulatedStation,
 )
+from tsgt.config.scenario_imu import ImuModelName, ImuSetupErrorConfig, ShakingConfig, SimulatedImu
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 
 __all__ = [
@@ -78,6 +79,8 @@ __all__ = [
     "FrameWatchConfig",
     "GeofenceConfig",
     "HardwareRadioConfig",
+    "ImuModelName",
+    "ImuSetupErrorConfig",
     "InstrumentConfig",
     "InstrumentModelConfig",
     "JournalConfig",
@@ -100,6 +103,8 @@ __all__ = [
     "ScenarioConfig",
     "ScenarioRadioConfig",
     "SetupConfig",
+    "ShakingConfig",
+    "SimulatedImu",
     "SimulatedRadioConfig",
     "SimulatedStation",
     "StationCalibration",

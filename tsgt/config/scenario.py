@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from tsgt.config.base import Model, NoiseConfig, NotNegative, Number, Place, Positive, unique_by
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
+from tsgt.config.scenario_imu import ShakingConfig, SimulatedImu
 
 # Sigma of a Gaussian: below a time step it has no effect, far above a mission it takes for ever.
 Smoothing = Annotated[float, Field(ge=0.01, le=1000)]
@@ -203,6 +204,10 @@ class ScenarioConfig(Model):
     """Duration; commands may override it."""
     motion: MotionConfig = MotionConfig()
     """Motion of the robot."""
+    shaking: ShakingConfig = ShakingConfig()
+    """Fast shaking of the driving robot."""
+    imu: SimulatedImu = SimulatedImu()
+    """The robot's IMU; none by default."""
     stations: Annotated[tuple[SimulatedStation, ...], unique_by("station")] = (
         SimulatedStation(station=1, prism=1, position_m=(0.0, 0.0, 0.0)),
         SimulatedStation(station=2, prism=2, position_m=(2.0, -1.5, 0.1), yaw_deg=25.0),

@@ -2,7 +2,7 @@
 
 The robot follows velocity commands (speed and yaw rate, each constant for some seconds) or drives along a route, with
 smooth transitions and vibration from the ground. The motion is integrated on a fine grid and interpolated by cubic
-splines. The splines are the ground truth: defined at every instant, and smooth.
+splines. The splines are the ground truth: defined at every instant, and smooth. Faster shaking may be added to them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from tsgt.geometry import transform_from, transform_points
+from tsgt.simulation.rigid_motion import RigidMotion, euler_rates, rotation_from_euler
+from tsgt.simulation.shaking import Shaking
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from tsgt.config import MotionConfig, OcclusionConfig, ScenarioConfig
+    from tsgt.config import MotionConfig, OcclusionConfig, ScenarioConfig, ShakingConfig
 
 STEP_S = 0.02
 
@@ -42,6 +44,11 @@ class World:
         The truth covers 0 to this time.
     occlusions_s
         Occlusions by station number: start and end in s from the start, (K, 2).
+
+    Attributes
+    ----------
+    shaking
+        Fast shaking while driving; None: there is none.
     """
 
     def __init__(
@@ -58,6 +65,15 @@ class World:
         # Two extra steps keep the last instant inside the splines despite rounding.
         times_s = np.arange(math.ceil(duration_s / STEP_S) + 3) * STEP_S
         self._spline = CubicSpline(times_s, _integrate_motion(motion, len(times_s), generator))
+        self.shaking: Shaking | None = None
+
+    def shake(
+        self, config: ShakingConfig, pivot_m: NDArray[np.float64], generator: np.random.Generator
+    ) -> None:
+        """Add shaking about a point of the robot, (3,) in frame ``robot``; poses, prisms and motion are shaken from now on."""
+        times_s = self._spline.x
+        speed_mps = np.linalg.norm(self._spline(times_s, 1)[:, :2], axis=1)
+        self.shaking = Shaking(config, pivot_m, times_s, speed_mps, generator)
 
     def pose_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``T_station1_robot`` at N instants in s from the start: (N, 4, 4).
@@ -67,13 +83,38 @@ class World:
         ValueError
             An instant is outside the covered time.
         """
+        times_s = self._covered(times_s)
+        state = self._spline(times_s)
+        rotation, position_m = rotation_from_euler(state[:, 3], state[:, 4], state[:, 5]), state[:, :3]
+        if self.shaking is not None:
+            rotation, position_m = self.shaking.shaken_pose(times_s, rotation, position_m)
+        return transform_from(rotation, position_m)
+
+    def motion_at(self, times_s: NDArray[np.float64]) -> RigidMotion:
+        """Return the motion of the frame ``robot`` at N instants: the exact derivatives of the poses.
+
+        Raises as :meth:`pose_at`.
+        """
+        times_s = self._covered(times_s)
+        state, first, second = (self._spline(times_s, order) for order in range(3))
+        rate, acceleration = euler_rates(state[:, 3:], first[:, 3:], second[:, 3:])
+        motion = RigidMotion(
+            rotation_from_euler(state[:, 3], state[:, 4], state[:, 5]),
+            state[:, :3],
+            first[:, :3],
+            second[:, :3],
+            rate,
+            acceleration,
+        )
+        return motion if self.shaking is None else self.shaking.shaken_motion(times_s, motion)
+
+    def _covered(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         times_s = np.asarray(times_s, dtype=np.float64)
         if times_s.size and not (times_s.min() >= 0.0 and times_s.max() <= self.duration_s):
             raise ValueError(
                 f"the ground truth covers 0 to {self.duration_s} s, got {times_s.min()} to {times_s.max()} s"
             )
-        state = self._spline(times_s)
-        return transform_from(_rotation(state[:, 3], state[:, 4], state[:, 5]), state[:, :3])
+        return times_s
 
     def prism_at(self, times_s: NDArray[np.float64], index: int) -> NDArray[np.float64]:
         """Return the position of a prism, by its row in the layout, in ``station1`` at N instants: (N, 3)."""
@@ -249,22 +290,3 @@ def _unit_noise(n: int, columns: int, sigma_s: float, generator: np.random.Gener
 def _smoothed(columns: NDArray[np.float64], sigma_s: float) -> NDArray[np.float64]:
     smoothed: NDArray[np.float64] = gaussian_filter1d(columns, sigma_s / STEP_S, axis=0, mode="reflect")
     return smoothed
-
-
-def _rotation(
-    yaw: NDArray[np.float64], pitch: NDArray[np.float64], roll: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Rotation about z by yaw, then about the new y by pitch, then about the new x by roll: (N, 3, 3)."""
-    cy, sy = np.cos(yaw), np.sin(yaw)
-    cp, sp = np.cos(pitch), np.sin(pitch)
-    cr, sr = np.cos(roll), np.sin(roll)
-    rotation = np.empty((*yaw.shape, 3, 3))
-    rows = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-    for i, row in enumerate(rows):
-        for j, column in enumerate(row):
-            rotation[..., i, j] = column
-    return rotation

@@ -1,0 +1,44 @@
+"""The robot's IMU in the simulated world. Sans-I/O.
+
+In: the motion of the robot at any instant, a scenario's IMU, conditions (faults). Out: `DeviceSamples` as a device delivers
+them, with counter, own clock and arrival, and `ImuTruth`.
+"""
+
+from tsgt.simulation.imu.conditions import (
+    DeviceClockJump,
+    Dropout,
+    ImuCondition,
+    Knock,
+    LateBurst,
+    Saturation,
+    Silence,
+    StuckValues,
+)
+from tsgt.simulation.imu.environment import Environment, normal_gravity_mps2
+from tsgt.simulation.imu.presets import CONSUMER, IMU_MODELS, INDUSTRIAL, ImuModel
+from tsgt.simulation.imu.samples import DeviceSamples, ImuTruth, Mounting, SimulatedImuRun
+from tsgt.simulation.imu.synthesis import ideal_samples, mounting_of, simulate_imu
+
+__all__ = [
+    "CONSUMER",
+    "IMU_MODELS",
+    "INDUSTRIAL",
+    "DeviceClockJump",
+    "DeviceSamples",
+    "Dropout",
+    "Environment",
+    "ImuCondition",
+    "ImuModel",
+    "ImuTruth",
+    "Knock",
+    "LateBurst",
+    "Mounting",
+    "Saturation",
+    "Silence",
+    "SimulatedImuRun",
+    "StuckValues",
+    "ideal_samples",
+    "mounting_of",
+    "normal_gravity_mps2",
+    "simulate_imu",
+]

@@ -249,18 +249,7 @@ def assemble(
     linearised = linearise(observations, knots, knot_index)
     whitened = linearised.whitened(observations)
     squared_distances = dot(whitened[:, :, 18], whitened[:, :, 18])
-    ratio = np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0)
-    weights = 1.0 / ratio
-    capped = np.minimum(squared_distances, OUTLIER_THRESHOLD**2) + OUTLIER_THRESHOLD**2 * np.log(ratio)
-    # Where most measurements are outliers the trajectory or the set-up is wrong, not the measurements.
-    if rejectable is not None and 2 * np.count_nonzero(ratio == 1.0) > len(ratio):
-        rejected = rejectable & (squared_distances > REJECTION_THRESHOLD**2)
-        weights[rejected] = 0.0
-        capped[rejected] = OUTLIER_THRESHOLD**2 * (
-            1.0 + 2.0 * math.log(REJECTION_THRESHOLD / OUTLIER_THRESHOLD)
-        )
-    if active is not None:
-        weights[~active] = capped[~active] = 0.0
+    weights, loss = robust_loss(squared_distances, active=active, rejectable=rejectable)
 
     diagonal, off_diagonal = (
         np.zeros((len(knots), STATE_DIM, STATE_DIM)),
@@ -268,7 +257,7 @@ def assemble(
     )
     gradient = np.zeros((len(knots), STATE_DIM))
     add_measurements(whitened, weights, knot_index, diagonal, gradient)
-    cost = float(capped.sum())
+    cost = float(loss.sum())
     for start in range(0, len(off_diagonal), _FACTORS_PER_CHUNK):
         chunk, chunk_knots = (
             slice(start, start + _FACTORS_PER_CHUNK),
@@ -297,6 +286,28 @@ def assemble(
     )
 
 
+def robust_loss(
+    squared_distances: FloatArray,
+    *,
+    active: NDArray[np.bool_] | None = None,
+    rejectable: NDArray[np.bool_] | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Weights and losses of M measurements from their squared Mahalanobis distances; masks as for :func:`assemble`."""
+    ratio = np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0)
+    weights = 1.0 / ratio
+    loss = np.minimum(squared_distances, OUTLIER_THRESHOLD**2) + OUTLIER_THRESHOLD**2 * np.log(ratio)
+    # Where most measurements are outliers the trajectory or the set-up is wrong, not the measurements.
+    if rejectable is not None and 2 * np.count_nonzero(ratio == 1.0) > len(ratio):
+        rejected = rejectable & (squared_distances > REJECTION_THRESHOLD**2)
+        weights[rejected] = 0.0
+        loss[rejected] = OUTLIER_THRESHOLD**2 * (
+            1.0 + 2.0 * math.log(REJECTION_THRESHOLD / OUTLIER_THRESHOLD)
+        )
+    if active is not None:
+        weights[~active] = loss[~active] = 0.0
+    return weights, loss
+
+
 def add_measurements(
     whitened: FloatArray,
     weights: FloatArray,
@@ -304,7 +315,8 @@ def add_measurements(
     diagonal: FloatArray,
     gradient: FloatArray,
 ) -> None:
-    """Add measurements, whitened, (M, 3, 19), and weighted, (M,), to the normal equations, in place."""
+    """Add measurements, whitened, (M, 3, B + 1), and weighted, (M,), to the normal equations of blocks of B, in place."""
+    size = diagonal.shape[-1]
     order = np.argsort(knot_index, kind="stable")
     for start in range(0, len(knot_index), _MEASUREMENTS_PER_CHUNK):
         chunk = order[start : start + _MEASUREMENTS_PER_CHUNK]
@@ -314,8 +326,8 @@ def add_measurements(
         occurrence = np.arange(len(chunk_knots)) - np.searchsorted(chunk_knots, chunk_knots)
         for number in range(int(occurrence.max()) + 1):
             selected = occurrence == number
-            diagonal[chunk_knots[selected]] += normal[selected, :STATE_DIM, :STATE_DIM]
-            gradient[chunk_knots[selected]] += normal[selected, :STATE_DIM, STATE_DIM]
+            diagonal[chunk_knots[selected]] += normal[selected, :size, :size]
+            gradient[chunk_knots[selected]] += normal[selected, :size, size]
 
 
 def apply_linear_step(

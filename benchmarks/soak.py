@@ -95,7 +95,7 @@ class Sums:
     measurements, poses
         What was delivered, and how many poses were called valid.
     above
-        How many valid poses of the continuous estimator exceed each of :data:`LIMITS`, and all of them, by kind.
+        How many valid poses of the continuous estimator exceed each of :data:`LIMITS`, and all of them, by series.
     violations
         What must not happen and did: how to get it again, and what it was.
     """
@@ -162,18 +162,18 @@ def _count(done: MissionResult, sums: Sums) -> None:
         poses = session.valid_poses()
         sums.measurements += len(session.measurements)
         sums.poses += len(poses.stamp_ns)
-        for kind in ("predicted", "smoothed"):
-            some = poses.select(poses.kind == kind)
+        for series in np.unique(poses.series).tolist():
+            some = poses.select(poses.series == series)
             if not len(some.stamp_ns):
                 continue
             truth = done.world.pose_at((some.stamp_ns - session.unix_at_zero_ns) / 1e9)
             turned = rotation_from_quaternion(some.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
             errors = np.concatenate([some.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
             nees = normalised_squared(errors, some.covariance)
-            sums.above[f"{kind}, all"] += len(nees)
-            sums.above[f"{kind}, sum"] += round(float(nees.sum()))
+            sums.above[f"{series}, all"] += len(nees)
+            sums.above[f"{series}, sum"] += round(float(nees.sum()))
             for limit in LIMITS:
-                sums.above[f"{kind}, above {limit:g}"] += int(np.count_nonzero(nees > limit))
+                sums.above[f"{series}, above {limit:g}"] += int(np.count_nonzero(nees > limit))
 
 
 def report(sums: Sums) -> None:
@@ -187,13 +187,13 @@ def report(sums: Sums) -> None:
             f"{speed:5.1f} simulated s per s of CPU"
         )
     print(f"  {sums.measurements} measurements delivered, {sums.poses} valid poses")
-    for kind in ("predicted", "smoothed"):
-        if count := sums.above[f"{kind}, all"]:
+    for series in sorted(name.removesuffix(", all") for name in sums.above if name.endswith(", all")):
+        if count := sums.above[f"{series}, all"]:
             shares = ", ".join(
-                f"{sums.above[f'{kind}, above {limit:g}']} above {limit:g}" for limit in LIMITS
+                f"{sums.above[f'{series}, above {limit:g}']} above {limit:g}" for limit in LIMITS
             )
-            mean = sums.above[f"{kind}, sum"] / count
-            print(f"  squared errors in sigmas, {kind}: mean {mean:.2f} of 6; of {count} poses {shares}")
+            mean = sums.above[f"{series}, sum"] / count
+            print(f"  squared errors in sigmas, {series}: mean {mean:.2f} of 6; of {count} poses {shares}")
     print("  " + ", ".join(f"{count} {kind}" for kind, count in sorted(sums.faults.items())))
 
 

@@ -25,7 +25,7 @@ def follow(path: str) -> None:
             # Ignore all other types, also those of later versions.
             if record["type"] != "pose":
                 continue
-            # Each pose is streamed again a few seconds later, smoothed; this program uses the prediction.
+            # Each pose is streamed again a second and a few seconds later, smoothed; this program uses the prediction.
             if record["kind"] == "smoothed":
                 continue
             if not record["valid"]:

@@ -383,6 +383,9 @@ class PipelineParameters(FiniteNumbers):
     lag_ns: int = 3_000_000_000
     """Lag of the smoothed poses in ns; measurements that arrive later after they were made are not used. For
     ``continuous``."""
+    smoothed_delays_ns: tuple[int, ...] = ()
+    """Delays in ns at which smoothed poses are computed before the lag, each at the first epoch at which it has passed.
+    For ``continuous``; none in recordings of older versions."""
     position_sigma_limit_m: float = 0.05
     """A smoothed pose whose position (of the reference point, in its least certain direction) has a sigma above this is
     invalid. For ``continuous``."""
@@ -411,6 +414,11 @@ class PipelineParameters(FiniteNumbers):
             predicted_position_sigma_limit_m=(0, 1e6),
             predicted_rotation_sigma_limit_rad=(0, math.pi),
         )
+        for delay_ns in self.smoothed_delays_ns:
+            if not 0 < delay_ns < self.lag_ns:
+                raise ValueError(
+                    f"smoothed_delays_ns: {delay_ns} is not between 0 and lag_ns ({self.lag_ns})"
+                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,7 +82,7 @@ class Scene:
         """Return the scene with another motion."""
         return replace(self, motion=motion)
 
-    def with_limits(self, **limits: float | str) -> Scene:
+    def with_limits(self, **limits: float | str | tuple[int, ...]) -> Scene:
         """Return the scene with other pipeline parameters."""
         pipeline = replace(self.parameters.pipeline, **limits)  # type: ignore[arg-type]
         return replace(self, parameters=replace(self.parameters, pipeline=pipeline))

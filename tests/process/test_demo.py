@@ -146,7 +146,7 @@ def test_demo_streams_records_and_summarises(start: Start, folder: Path, protoco
     assert isinstance(result["position_rms_mm"], float)
     assert result["position_rms_mm"] < 60.0
     assert isinstance(result["live"], dict)
-    assert result["live"].keys() == {"predicted", "smoothed"}
+    assert result["live"].keys() == {"predicted", "smoothed", "smoothed_1s"}
     assert lines[0]["type"] == "hello"
     assert any(line["type"] == "pose" and line["valid"] for line in lines)
     statuses = [line for line in lines if line["type"] == "status"]

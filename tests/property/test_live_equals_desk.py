@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 TRANSPORT_NS = 2_000_000_000
 SCENE = stationary_scene().moving(driving)
-CONTINUOUS = SCENE.with_limits(estimator="continuous")
+CONTINUOUS = SCENE.with_limits(estimator="continuous", smoothed_delays_ns=(400_000_000, 1_000_000_000))
 
 # A fourth station helps the first on its prism.
 FOUR = replace(

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 STDOUT = Path("-")
 
+_FINAL = ("interpolated", "smoothed")
+
 FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
 
 
@@ -57,7 +59,12 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
 @click.option(
     "--kind",
     type=click.Choice(["interpolated", "predicted", "smoothed"]),
-    help="Kind of poses, if a recording contains several.  [default: all but predicted]",
+    help="Kind of poses, if a recording contains several.  [default: interpolated and smoothed]",
+)
+@click.option(
+    "--delay-s",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Smoothed poses of this delay, as they were streamed before the final ones.  [default: the final ones]",
 )
 @click.option(
     "--reference",
@@ -81,6 +88,7 @@ def export(
     format_name: str | None,
     records: str,
     kind: Kind | None,
+    delay_s: float | None,
     reference_path: Path | None,
     output: Path,
     point: ReferencePoint | None,
@@ -90,7 +98,7 @@ def export(
     """Convert a recording to TUM, CSV or MCAP.
 
     Exports the poses of the recording; a recording without poses is processed first. If an epoch has a predicted and
-    a smoothed pose, the smoothed one is exported. TUM and MCAP contain valid poses only, CSV all poses with the reason
+    a smoothed pose, the final smoothed one is exported. TUM and MCAP contain valid poses only, CSV all poses with the reason
     why one is invalid.
     """
     if format_name is None:
@@ -99,6 +107,9 @@ def export(
         if output.suffix not in FORMATS:
             raise click.UsageError(unknown_suffix(output, tuple(FORMATS)))
         format_name = FORMATS[output.suffix]
+    if delay_s is not None and kind not in (None, "smoothed"):
+        raise click.UsageError(f"{kind} poses have no delay; --delay-s selects smoothed ones")
+    series = kind if delay_s is None else f"smoothed_{delay_s:g}s"
     if records == "measurements" and format_name != "csv":
         raise click.UsageError(
             "TUM contains poses only, MCAP poses and prism positions; export raw measurements with --format csv"
@@ -115,7 +126,7 @@ def export(
     if format_name == "mcap":
         reference = load_reference(reference_path, reference_point)
         loaded = load(recording, keep_going=keep_going, point=point)
-        poses = _poses_of(recording, kind, point, keep_going=keep_going, loaded=loaded)
+        poses = _poses_of(recording, series, point, keep_going=keep_going, loaded=loaded)
         with write_atomically(output) as file:
             write_mcap(file, messages(loaded, poses, reference))
         return
@@ -123,7 +134,7 @@ def export(
     if records == "measurements":
         lines = measurement_csv(load(recording, keep_going=keep_going).measurements)
     else:
-        poses = _poses_of(recording, kind, point, keep_going=keep_going, quiet=output == STDOUT)
+        poses = _poses_of(recording, series, point, keep_going=keep_going, quiet=output == STDOUT)
         lines = pose_csv(poses) if format_name == "csv" else tum_lines(valid_records(poses), point)
     if output == STDOUT:
         sys.stdout.writelines(lines)
@@ -142,7 +153,7 @@ def _first_reference_point(path: Path) -> ReferencePoint:
 
 def _poses_of(
     path: Path,
-    kind: Kind | None,
+    series: str | None,
     point: ReferencePoint,
     *,
     keep_going: bool,
@@ -155,17 +166,17 @@ def _poses_of(
     ``loaded`` have been reported already.
     """
     found = False
-    recorded = _recorded_poses(path, kind, keep_going=keep_going, quiet=quiet, reported=loaded is not None)
+    recorded = _recorded_poses(path, series, keep_going=keep_going, quiet=quiet, reported=loaded is not None)
     for own_point, poses in itertools.groupby(recorded, key=lambda pair: pair[0]):
         found = True
         of_point = (pose for _, pose in poses)
         yield from of_point if own_point == point else records_at(of_point, own_point, point)
     if found:
         return
-    if kind is not None:
-        raise RecordingError(
-            f"holds no {kind} poses; omit --kind to export or compute other poses", path=path
-        )
+    if series is not None:
+        kind, _, delay = series.partition("_")
+        which, option = (f"{kind} poses at {delay}", "--delay-s") if delay else (f"{kind} poses", "--kind")
+        raise RecordingError(f"holds no {which}; omit {option} to export or compute other poses", path=path)
     click.echo(f"{path} holds no poses; processing its measurements", err=True)
     with progress("fitting", first=TUNING) as on_progress:
         loaded = loaded or load(path, keep_going=keep_going, point=point)
@@ -174,9 +185,9 @@ def _poses_of(
 
 
 def _recorded_poses(
-    path: Path, kind: Kind | None, *, keep_going: bool, quiet: bool, reported: bool
+    path: Path, series: str | None, *, keep_going: bool, quiet: bool, reported: bool
 ) -> Iterator[tuple[ReferencePoint, PoseRecord]]:
-    """Yield the poses of a kind (default: all but predicted), each with its point."""
+    """Yield the poses of a series (default: interpolated and final ones), each with its point."""
     point = ROBOT_ORIGIN
     on_problem = None if reported else report_problem
     done_bytes = 0
@@ -197,7 +208,7 @@ def _recorded_poses(
                     raise
                 report_problem(problem)
             else:
-                if pose.kind != "predicted" if kind is None else pose.kind == kind:
+                if pose.series in (_FINAL if series is None else (series,)):
                     yield point, pose
         if on_progress is not None:
             on_progress(1.0)

@@ -101,10 +101,11 @@ def _pose(pose: PoseRecord) -> str:
     validity = "valid" if pose.valid else f"invalid ({pose.reason})"
     if pose.degraded_by:
         validity += f", degraded ({', '.join(pose.degraded_by)})"
-    parts = [clock_time(pose.stamp_ns), "pose", pose.kind, validity]
+    kind = pose.kind if pose.delay_s is None else f"{pose.kind} at {pose.delay_s:g} s"
+    parts = [clock_time(pose.stamp_ns), "pose", kind, validity]
     if pose.position_m is not None and pose.orientation_xyzw is not None:
         yaw, pitch, roll = yaw_pitch_roll_deg(pose.orientation_xyzw)
-        parts.append(f"{_vector(pose.position_m)} m")
+        parts.append(f"{pose.child_frame} {_vector(pose.position_m)} m")
         parts.append(f"yaw {yaw:.2f} pitch {pitch:.2f} roll {roll:.2f} deg")
     if pose.residual_m is not None:
         parts.append(f"residual {1e3 * pose.residual_m:.1f} mm")

@@ -121,6 +121,10 @@ def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
         ),
         noise_scale=pipeline.noise_scale,
         lag_ns=round(pipeline.lag_s * 1e9),
+        # A lag that is shorter than the default delay leaves nothing to smooth before it.
+        smoothed_delays_ns=tuple(
+            round(delay_s * 1e9) for delay_s in sorted(pipeline.smoothed_delays_s) if delay_s < pipeline.lag_s
+        ),
         position_sigma_limit_m=pipeline.position_sigma_limit_mm / 1e3,
         rotation_sigma_limit_rad=math.radians(pipeline.rotation_sigma_limit_deg),
         predicted_position_sigma_limit_m=pipeline.predicted_position_sigma_limit_mm / 1e3,

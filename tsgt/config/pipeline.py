@@ -12,7 +12,10 @@ from tsgt.model import ROBOT_FRAME, ReferencePoint, Row4
 # The limits of the estimator, see MotionPrior.
 Acceleration = Annotated[float, Field(ge=1e-6, le=1e6)]
 PerAxis = tuple[Acceleration, Acceleration, Acceleration]
+Delay = Annotated[float, Field(gt=0, le=60)]
 Lasting = Annotated[float, Field(ge=1e-3, le=1e4)]
+
+MAX_DELAYS = 4  # each costs as much as the predictions
 
 
 class MotionConfig(Model):
@@ -53,6 +56,8 @@ class PipelineConfig(Model):
     """Factor on the noise of all instruments; for `continuous`."""
     lag_s: Annotated[float, Field(gt=0, le=60)] = 3.0
     """Lag after which a live pose is smoothed and final; for `continuous`."""
+    smoothed_delays_s: Annotated[tuple[Delay, ...], Field(max_length=MAX_DELAYS)] = (1.0,)
+    """Delays below `lag_s` after which a live pose is smoothed by what has arrived; for `continuous`."""
     position_sigma_limit_mm: Positive = 50.0
     """Maximum position sigma of a valid smoothed pose, at the reference point; for `continuous`."""
     rotation_sigma_limit_deg: Annotated[float, Field(gt=0, le=180)] = 2.0
@@ -61,6 +66,17 @@ class PipelineConfig(Model):
     """Maximum position sigma of a valid predicted pose, at the reference point; for `continuous`."""
     predicted_rotation_sigma_limit_deg: Annotated[float, Field(gt=0, le=180)] = 5.0
     """Maximum rotation sigma of a valid predicted pose; for `continuous`."""
+
+    @model_validator(mode="after")
+    def _delays_are_below_the_lag(self) -> PipelineConfig:
+        delays_s = self.smoothed_delays_s
+        if len(set(delays_s)) < len(delays_s):
+            raise ValueError("smoothed_delays_s: each delay must be given once")
+        if "smoothed_delays_s" in self.model_fields_set and max(delays_s, default=0.0) >= self.lag_s:
+            raise ValueError(
+                f"smoothed_delays_s: {max(delays_s):g} is not below lag_s ({self.lag_s:g}), after which poses are final"
+            )
+        return self
 
 
 class ReferencePointConfig(Model):

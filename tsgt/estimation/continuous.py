@@ -2,7 +2,8 @@
 
 Each epoch (the whole multiples of a period in Unix time) gets a pose *predicted* from all measurements that were added
 before, and a lag later one *smoothed* by the measurements on both sides. Smoothed poses are computed in groups, with the
-first prediction of each half second, which is cheaper. The poses depend only on the order of the calls, not on when the
+first prediction of each half second, which is cheaper. At each of the configured delays below the lag there is one more,
+smoothed by the measurements that have arrived by the first epoch at which the delay has passed. The poses depend only on the order of the calls, not on when the
 estimator is asked: a replay gives the same poses bit for bit.
 """
 
@@ -64,6 +65,9 @@ class ContinuousEstimator:
         self._origin_ns = 0
         self._next_epoch_ns: int | None = None
         self._next_smoothed_ns = 0
+        self._first_epoch_ns = 0
+        # The oldest epoch first. The window still has the states: a delay is below the lag.
+        self._delays_ns = np.array(sorted(self._limits.smoothed_delays_ns, reverse=True), dtype=np.int64)
         self.outside_lag_window: Counter[int] = Counter()
         self._none = PoseBatch.blank(none, tuple(self._columns), Kind.PREDICTED)
 
@@ -72,7 +76,7 @@ class ContinuousEstimator:
         if self._next_epoch_ns is None:
             self._origin_ns = now_ns
             self._next_epoch_ns = (now_ns // self._limits.period_ns + 1) * self._limits.period_ns
-            self._next_smoothed_ns = self._next_epoch_ns
+            self._next_smoothed_ns = self._first_epoch_ns = self._next_epoch_ns
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement; implausible ones and those of unknown stations or prisms are ignored."""
@@ -97,7 +101,7 @@ class ContinuousEstimator:
             # Epochs up to the next smoothing use the same measurements.
             next_smoothing_ns = (epoch_ns // SMOOTHING_INTERVAL_NS + 1) * SMOOTHING_INTERVAL_NS
             due_ns = range(epoch_ns, min(now_ns + 1, next_smoothing_ns), period_ns)
-            batches.append(self._predicted(due_ns))
+            batches.append(self._with_delayed(self._predicted(due_ns)))
             self._next_epoch_ns = due_ns[-1] + period_ns
         return PoseBatch.concatenated(batches or [self._none])
 
@@ -173,11 +177,34 @@ class ContinuousEstimator:
             ambiguous=ambiguous,
         )
 
+    def _with_delayed(self, predicted: PoseBatch) -> PoseBatch:
+        """Return predicted poses, each after the smoothed ones whose delay has passed with its epoch."""
+        if not len(self._delays_ns):
+            return predicted
+        period_ns = self._limits.period_ns
+        sent_ns = np.repeat(predicted.stamp_ns, len(self._delays_ns))
+        delay_ns = np.tile(self._delays_ns, len(predicted))
+        stamp_ns = sent_ns - -(-delay_ns // period_ns) * period_ns
+        begun = stamp_ns >= self._first_epoch_ns
+        if not begun.any():
+            return predicted
+        sent_ns, delay_ns, stamp_ns = sent_ns[begun], delay_ns[begun], stamp_ns[begun]
+        delayed = replace(self._smoothed(stamp_ns, sent_ns), delay_ns=delay_ns)
+        order = np.argsort(np.concatenate([sent_ns, predicted.stamp_ns]), kind="stable")
+        return PoseBatch.concatenated([delayed, predicted]).select(order)
+
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
         """Return the smoothed poses of the epochs up to an instant, and discard what only they needed."""
         stamp_ns = np.arange(self._next_smoothed_ns, last_ns + 1, self._limits.period_ns, dtype=np.int64)
         if not len(stamp_ns):
             return self._none
+        poses = self._smoothed(stamp_ns)
+        self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
+        self._discard_old()
+        return poses
+
+    def _smoothed(self, stamp_ns: NDArray[np.int64], sent_ns: NDArray[np.int64] | None = None) -> PoseBatch:
+        """Return the smoothed poses of epochs in the window; ``sent_ns``: when each is sent, if before the lag."""
         states: States | None = None
         covariance = _NONE
         common: FloatArray | None = None
@@ -188,7 +215,7 @@ class ContinuousEstimator:
             common = trajectory.common_at(time_s, dim=_POSE_DIM)
         reliable = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)
         reliable &= ~self._window.ambiguous_at(time_s)
-        poses = self._poses.smoothed(
+        return self._poses.smoothed(
             stamp_ns,
             self._history,
             states,
@@ -196,10 +223,8 @@ class ContinuousEstimator:
             common=common,
             converged=reliable & self._window.converged,
             ambiguous=self._window.recently_ambiguous_at(time_s),
+            now_ns=sent_ns,
         )
-        self._next_smoothed_ns = int(stamp_ns[-1]) + self._limits.period_ns
-        self._discard_old()
-        return poses
 
     def _update_unusable(self) -> None:
         unusable_ns = [np.array(each, dtype=np.int64) for each in self._unusable]

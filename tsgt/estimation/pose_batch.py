@@ -76,6 +76,7 @@ class PoseBatch:
 
     stamp_ns: NDArray[np.int64]  # (N,) epochs on the master's Unix clock
     kind: NDArray[np.int8]  # (N,) values of :class:`Kind`
+    delay_ns: NDArray[np.int64]  # (N,) delay at which a pose was smoothed before the lag; 0: any other pose
     reason: NDArray[np.int8]  # (N,) values of :class:`Reason`
     degraded: NDArray[np.int8]  # (N,) values of :class:`Degradation` of valid poses; 0: good
     position_m: NDArray[np.float64]  # (N, 3) of the reference point in the frame ``station1``
@@ -103,6 +104,7 @@ class PoseBatch:
         return cls(
             stamp_ns=stamp_ns,
             kind=np.full(n, int(kind), np.int8),
+            delay_ns=np.zeros(n, np.int64),
             reason=np.zeros(n, np.int8),
             degraded=np.zeros(n, np.int8),
             position_m=np.full((n, 3), np.nan),
@@ -130,8 +132,8 @@ class PoseBatch:
         }
         return replace(some[0], **arrays)
 
-    def select(self, rows: NDArray[np.bool_]) -> PoseBatch:
-        """Return the poses of a mask."""
+    def select(self, rows: NDArray[np.bool_ | np.intp]) -> PoseBatch:
+        """Return the poses of a mask, or of indices in their order."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._arrays()}
         return replace(self, **arrays)
 
@@ -163,6 +165,7 @@ class PoseBatch:
         rows = zip(
             self.stamp_ns.tolist(),
             self.kind.tolist(),
+            self.delay_ns.tolist(),
             self.reason.tolist(),
             self.degraded.tolist(),
             computed.tolist(),
@@ -176,7 +179,7 @@ class PoseBatch:
             self._shares(),
             strict=True,
         )
-        for stamp, kind, reason, degraded, known, *arrays, residual, shares in rows:
+        for stamp, kind, delay, reason, degraded, known, *arrays, residual, shares in rows:
             position, orientation, covariance, common, velocity, angular_velocity = (
                 tuple(array) if known else None for array in arrays
             )
@@ -194,6 +197,7 @@ class PoseBatch:
                 angular_velocity_radps=angular_velocity,
                 estimator=Kind(kind).estimator,
                 kind=kinds[kind],
+                delay_s=delay / 1e9 if delay else None,
                 valid=reason == Reason.VALID,
                 reason=reasons[reason],
                 quality="invalid" if reason else "degraded" if degraded else "good",

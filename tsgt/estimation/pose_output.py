@@ -114,6 +114,7 @@ class ContinuousPoseOutput:
         common: NDArray[np.float64] | None = None,
         converged: NDArray[np.bool_] | None = None,
         ambiguous: NDArray[np.bool_] | None = None,
+        now_ns: NDArray[np.int64] | None = None,
     ) -> PoseBatch:
         """Return poses of the reference point from measurements on both sides of their epochs.
 
@@ -134,12 +135,19 @@ class ContinuousPoseOutput:
             (N,) whether the trajectory is reliable there; no other pose is valid. Default: everywhere.
         ambiguous
             (N,) whether the state was ambiguous shortly before, which degrades a pose. Default: nowhere.
+        now_ns
+            (N,) instants by which the next measurement of a prism must have arrived, unless the last one is within the
+            outage limit of them. A pose without any measurement from its epoch on is not computed. Default: at the end of
+            time.
         """
         batch = PoseBatch.blank(stamp_ns, self._prisms, Kind.SMOOTHED)
         for column in range(len(self._prisms)):
-            self._describe(batch, column, history)
+            self._describe(batch, column, history, now_ns)
+        known = None
+        if now_ns is not None:
+            known = stamp_ns <= history.times_ns.max(initial=_NEVER_NS)
         return self._with_poses(
-            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous
+            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous, known=known
         )
 
     def _latest(
@@ -160,7 +168,13 @@ class ContinuousPoseOutput:
         unusable = newest >= 0 and prism.unusable_ns[newest] > since_ns
         return station, age_s, math.nan, Reason.STATION_STATUS if unusable else Reason.OUTAGE
 
-    def _describe(self, batch: PoseBatch, column: int, history: MeasurementHistory) -> None:
+    def _describe(
+        self,
+        batch: PoseBatch,
+        column: int,
+        history: MeasurementHistory,
+        now_ns: NDArray[np.int64] | None,
+    ) -> None:
         """Fill in station and age of a prism's last measurement, its residual and its reason."""
         epochs_ns, unusable_ns = batch.stamp_ns, history.unusable_ns[column]
         rows = np.flatnonzero(history.prisms == column)
@@ -177,6 +191,8 @@ class ContinuousPoseOutput:
         until_ns = np.full(len(epochs_ns), -_NEVER_NS)
         until_ns[inside] = times_ns[following[inside]]
         nearest = np.where(until_ns - epochs_ns < epochs_ns - since_ns, following, latest)
+        if now_ns is not None:
+            until_ns = np.where(inside, until_ns, now_ns)
         out = until_ns - since_ns > self._limits.outage_limit_ns
         batch.prism_reason[out, column] = Reason.OUTAGE
         if len(unusable_ns):
@@ -199,8 +215,9 @@ class ContinuousPoseOutput:
         common: NDArray[np.float64] | None = None,
         converged: NDArray[np.bool_] | None = None,
         ambiguous: NDArray[np.bool_] | None = None,
+        known: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
-        """Fill in the poses that are known, and the reasons of invalid ones."""
+        """Fill in the poses that are ``known`` (default: all), and the reasons of invalid ones."""
         missing = batch.prism_reason.max(axis=1)
         if states is None:
             batch.reason[:] = np.where(missing, missing, Reason.DEGENERATE_GEOMETRY)
@@ -214,14 +231,16 @@ class ContinuousPoseOutput:
         states, covariance = state_at_point(states, covariance, self._to_origin_m)
         covariance, sigma_rad = with_second_order_terms(rotation, covariance)
         unknown = ~(sigma_rad < MAX_ROTATION_SIGMA_RAD)
+        if known is not None:
+            unknown |= ~known
         batch.position_m[:] = states.position
         batch.orientation_xyzw[:] = quaternion_from_rotation(rotation)
         batch.covariance[:] = ros_covariance(rotation, covariance)
         batch.velocity_mps[:] = states.velocity
         batch.angular_velocity_radps[:] = states.angular_velocity
-        known = np.isfinite(batch.prism_residual_m)
-        squares = np.where(known, batch.prism_residual_m, 0.0) ** 2
-        count = known.sum(axis=1)
+        fitted = np.isfinite(batch.prism_residual_m)
+        squares = np.where(fitted, batch.prism_residual_m, 0.0) ** 2
+        count = fitted.sum(axis=1)
         batch.residual_m[:] = np.where(count, np.sqrt(squares.sum(axis=1) / np.maximum(count, 1)), np.nan)
         if unknown.any():
             for numbers in (

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
     from tsgt.estimation.pose_batch import PoseBatch
     from tsgt.model import PipelineParameters
-    from tsgt.recording import stream_records
 
 MIN_PRISMS = 3
 DEGRADED_SHARE = 0.5
@@ -46,10 +45,9 @@ def sigma_limits(kind: NDArray[np.int8], limits: PipelineParameters) -> NDArray[
     return np.asarray(found[kind])
 
 
-def sigma_limits_of(
-    kind: stream_records.Kind, limits: PipelineParameters
-) -> tuple[float | None, float | None]:
-    """Return the limits of the sigmas of valid poses of a kind, in m and rad; None where there are none."""
+def sigma_limits_of(series: str, limits: PipelineParameters) -> tuple[float | None, float | None]:
+    """Return the limits of the sigmas of valid poses of a series, in m and rad; None where there are none."""
+    kind, _, _ = series.partition("_")
     if kind == "interpolated":
         return None, None
     limit_m, limit_rad = sigma_limits(np.array([Kind[kind.upper()]], np.int8), limits)[0].tolist()

@@ -13,10 +13,12 @@ import inspect
 import itertools
 import json
 import operator
+import typing
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
+from pydantic.fields import FieldInfo
 
 from tsgt import model, recording
 from tsgt.recording import journal
@@ -85,14 +87,19 @@ def json_schema() -> dict[str, Any]:
     for cls in (cls for classes in PAGES.values() for cls in classes):
         definition = definitions[cls.__name__]
         definition["description"] = _summary(cls)
-        # A record is written with every key, also those with a default.
-        definition["required"] = [field.name for field in dataclasses.fields(cls)]
+        # A record is written with every key, also those with a default, except where it says otherwise.
+        sometimes = _sometimes_written(cls)
+        definition["required"] = [
+            field.name for field in dataclasses.fields(cls) if field.name not in sometimes
+        ]
         descriptions = field_descriptions(cls)
         for name, field in definition["properties"].items():
             if "const" in field:
                 descriptions[name] = f"Always ``{field['const']}``."
             if name not in descriptions:
                 raise ValueError(f"{cls.__name__}.{name} has no docstring")
+            if name in sometimes:
+                field.update(next(each for each in field.pop("anyOf") if each["type"] != "null"))
             field.pop("title", None)
             field.pop("default", None)
             field["description"] = descriptions[name]
@@ -105,14 +112,26 @@ def json_schema() -> dict[str, Any]:
     }
 
 
+def _sometimes_written(cls: type) -> set[str]:
+    """Return the fields that are not written when they are None."""
+    return {
+        name
+        for name, hint in typing.get_type_hints(cls, include_extras=True).items()
+        for info in getattr(hint, "__metadata__", ())
+        if isinstance(info, FieldInfo) and info.exclude_if is not None
+    }
+
+
 def field_tables(classes: tuple[type, ...]) -> str:
     """Return a Markdown section with a table of fields for each class."""
     definitions = json_schema()["$defs"]
     sections = []
     for cls in classes:
         properties = definitions[cls.__name__]["properties"]
+        sometimes = _sometimes_written(cls)
         rows = [
-            f"| `{name}` | {_type_text(field)} | {'may be null' if _nullable(field) else 'yes'} "
+            f"| `{name}` | {_type_text(field)} "
+            f"| {'no' if name in sometimes else 'may be null' if _nullable(field) else 'yes'} "
             f"| {field['description'].replace('``', '`')} |"
             for name, field in properties.items()
         ]

@@ -42,6 +42,8 @@ LINEAR_PROMISE = (
 )
 
 # Aliases, because pydantic evaluates annotations at run time.
+OptionalDelay = Annotated[float | None, Field(exclude_if=lambda delay_s: delay_s is None)]
+"""Written only where there is one: the lines of all other poses are those of older versions."""
 PositionOrNone = Vector3 | None
 QuaternionOrNone = Row4 | None
 CovarianceOrNone = Annotated[tuple[float, ...], Field(min_length=36, max_length=36)] | None
@@ -155,7 +157,11 @@ class PoseRecord(FiniteNumbers):
     """Name of the estimator."""
     kind: Kind
     """``interpolated`` between measurements (estimator ``linear``), ``predicted`` from earlier measurements, at once,
-    or ``smoothed`` by measurements on both sides, a lag later."""
+    or ``smoothed`` by measurements on both sides: at a delay, see ``delay_s``, or a lag later and final."""
+    delay_s: OptionalDelay = None
+    """Of a smoothed pose at one of the configured ``smoothed_delays_s``: that delay, in s, after which it was computed
+    from the measurements that had arrived. The key is missing in all other poses. Without a measurement from after its
+    epoch it has no numbers, because it would be a prediction."""
     valid: bool
     """Whether the pose may be used. Invalid poses are sent too, with their reason."""
     reason: Reason
@@ -175,6 +181,11 @@ class PoseRecord(FiniteNumbers):
     """Root mean square over the prisms of their distance in m from the fitted layout; null without a fit."""
     stations: tuple[StationShare, ...]
     """One entry per prism of the layout: the station that tracks it."""
+
+    @property
+    def series(self) -> str:
+        """Name of the poses that belong together, one per epoch: their kind, with their delay as in ``smoothed_1s``."""
+        return self.kind if self.delay_s is None else f"{self.kind}_{self.delay_s:g}s"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -80,6 +80,19 @@ def test_csv_has_estimator_and_kind(tsgt: Tsgt, live: Path) -> None:
     assert len(rows) == 4
 
 
+def test_poses_at_a_delay_are_exported_on_request(tsgt: Tsgt, live: Path) -> None:
+    """By default they are not mixed with the final ones of the same epochs."""
+    delayed = dataclasses.replace(pose(1, "smoothed", 50.0), delay_s=0.6)
+    live.write_bytes(live.read_bytes() + encode_line(delayed) + b"\n")
+    assert xs(tsgt("export", live, "--format", "tum")) == [0.0, 1.0]
+    assert xs(tsgt("export", live, "--format", "tum", "--kind", "smoothed")) == [0.0, 1.0]
+    assert xs(tsgt("export", live, "--format", "tum", "--delay-s", "0.6")) == [50.0]
+    outcome = tsgt("export", live, "--format", "tum", "--delay-s", "1")
+    assert outcome.code == 1
+    assert "holds no smoothed poses at 1s; omit --delay-s" in outcome.err
+    assert tsgt("export", live, "--format", "tum", "--delay-s", "1", "--kind", "predicted").code == 2
+
+
 def test_missing_kind_is_an_error(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
     """Nothing is computed instead, and no file is written."""
     output = tmp_path / "out.tum"

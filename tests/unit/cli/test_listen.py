@@ -25,7 +25,7 @@ LINES = [encode_line(record) for record in (HELLO, measurement(0), POINT, POSE, 
 
 
 POSE_TEXT = (
-    "22:13:20.050  pose  interpolated  valid  1.000 2.000 -0.100 m  yaw 73.74 pitch 0.00 roll 0.00 deg"
+    "22:13:20.050  pose  interpolated  valid  robot 1.000 2.000 -0.100 m  yaw 73.74 pitch 0.00 roll 0.00 deg"
     "  residual 2.1 mm  ages 1: 0.25 s"
 )
 STATUS_TEXT = (

@@ -60,6 +60,14 @@ def test_degraded_pose_says_by_what() -> None:
     assert "valid, degraded (old_measurements, uncertain)" in text
 
 
+def test_pose_at_a_delay_says_so_and_names_its_point() -> None:
+    """A position is of a point, and one epoch has several poses."""
+    delayed = replace(POSE, kind="smoothed", delay_s=0.6, child_frame="lidar")
+    text = render("pose", encode_line(delayed))
+    assert text is not None
+    assert "pose  smoothed at 0.6 s  valid  lidar 1.000 2.000 -0.100 m" in text
+
+
 def test_clock_text_has_the_sign_in_words() -> None:
     """A negative offset is a clock that is behind."""
     assert render("clock", encode_line(CLOCK)) == (

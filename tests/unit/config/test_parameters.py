@@ -123,9 +123,19 @@ def test_wrong_covariance_is_rejected(folder: Path, components: str, matrix: str
 
 
 def test_defaults_are_those_of_the_model() -> None:
-    """An empty configuration has the defaults of the parameters."""
-    assert pipeline_parameters(PipelineConfig()) == PipelineParameters()
+    """An empty configuration has the defaults of the parameters; recordings of older versions have no delays."""
+    assert pipeline_parameters(PipelineConfig(smoothed_delays_s=())) == PipelineParameters()
     assert noise(NoiseConfig()) == TRACKING_NOISE
+
+
+def test_delays_are_below_the_lag() -> None:
+    """A lag below the default delay leaves none; a given delay that is too long is a mistake."""
+    assert pipeline_parameters(PipelineConfig()).smoothed_delays_ns == (1_000_000_000,)
+    assert pipeline_parameters(PipelineConfig(lag_s=0.8)).smoothed_delays_ns == ()
+    with pytest.raises(ValueError, match=r"smoothed_delays_s: 1 is not below lag_s \(0.8\)"):
+        PipelineConfig(lag_s=0.8, smoothed_delays_s=(0.5, 1.0))
+    with pytest.raises(ValueError, match="each delay must be given once"):
+        PipelineConfig(smoothed_delays_s=(0.5, 0.5))
 
 
 def test_untracked_prism_is_omitted(folder: Path) -> None:

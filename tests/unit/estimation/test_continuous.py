@@ -13,6 +13,7 @@ from tsgt.estimation import Kind, PoseBatch, Reason
 from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
 from tsgt.model import PolarMeasurement, PrismPosition, ReferencePoint, Status
+from tsgt.recording import encode_line
 
 PERIOD = 50_000_000
 LAG = 3 * SECOND
@@ -73,6 +74,89 @@ def test_each_epoch_has_a_predicted_and_a_smoothed_pose(scene: Scene) -> None:
     first = START + 200_000_000 + PERIOD
     assert predicted.stamp_ns.tolist() == list(range(first, START + 8 * SECOND + 1, PERIOD))
     assert smoothed.stamp_ns.tolist() == list(range(first, START + 5 * SECOND + 1, PERIOD))
+
+
+def delayed_of(batch: PoseBatch, delay_s: float) -> PoseBatch:
+    """Return the poses of one delay."""
+    return batch.select(batch.delay_ns == round(delay_s * SECOND))
+
+
+def with_delays(
+    scene: Scene, delays_s: tuple[float, ...], measurements: list[PolarMeasurement], until_s: float
+) -> tuple[PoseBatch, PoseBatch]:
+    """Predicted and smoothed poses of a live run with delays."""
+    delays_ns = tuple(round(each * SECOND) for each in delays_s)
+    return stream(scene.with_limits(smoothed_delays_ns=delays_ns), measurements, until_s)
+
+
+def test_poses_at_delays_leave_the_others_as_they_are(scene: Scene) -> None:
+    """Predicted and final poses have the same bits, whatever delays there are."""
+    measurements = every(scene, 8.0)
+    expected = stream(scene, measurements, 8.0)
+    predicted, smoothed = with_delays(scene, (0.4, 1.0), measurements, 8.0)
+    for found, plain in ((predicted, expected[0]), (delayed_of(smoothed, 0.0), expected[1])):
+        assert [encode_line(a) for a in found.records()] == [encode_line(a) for a in plain.records()]
+
+
+@pytest.mark.parametrize(("delay_s", "epochs"), [(1.0, 20), (0.97, 20), (0.33, 7)])
+def test_pose_at_a_delay_is_that_of_its_epoch(scene: Scene, delay_s: float, epochs: int) -> None:
+    """Sent at the first epoch at which the delay has passed, and better than the prediction of its epoch."""
+    predicted, smoothed = with_delays(scene, (delay_s,), every(scene, 8.0), 8.0)
+    delayed = delayed_of(smoothed, delay_s)
+    assert delayed.stamp_ns.tolist() == predicted.stamp_ns[:-epochs].tolist()
+    late = delayed.valid & (delayed.stamp_ns > START + 2 * SECOND)
+    assert late.any()
+    assert off(scene, delayed.select(late))[0] < 0.01
+    sigmas = [np.trace(each.covariance[60:100], axis1=1, axis2=2).mean() for each in (predicted, delayed)]
+    assert sigmas[1] < 0.5 * sigmas[0]
+
+
+def test_pose_without_later_measurements_is_not_called_smoothed(scene: Scene) -> None:
+    """In an outage a pose at a delay has no numbers: it would be a prediction."""
+    measurements = every(scene, 6.0)
+    newest_ns = max(m.stamp_ns for m in measurements)
+    _, smoothed = with_delays(scene, (0.2, 1.0), measurements, 8.0)
+    for delay_s, reasons in ((0.2, {Reason.UNCERTAIN, Reason.OUTAGE}), (1.0, {Reason.OUTAGE})):
+        delayed = delayed_of(smoothed, delay_s)
+        after = delayed.stamp_ns > newest_ns
+        assert after.sum() > 15
+        assert set(delayed.reason[after].tolist()) == reasons
+        assert np.isnan(delayed.position_m[after]).all()
+        before = ~after & (delayed.stamp_ns > newest_ns - SECOND // 4)
+        assert np.isfinite(delayed.position_m[before]).all()
+
+
+def test_prism_is_not_missing_before_its_next_measurement_can_be_late(scene: Scene) -> None:
+    """At a delay shorter than the interval of measurements its last one is still within the outage limit."""
+    _, smoothed = with_delays(scene, (0.2,), every(scene, 6.0), 6.0)
+    delayed = delayed_of(smoothed, 0.2)
+    late = delayed.select(delayed.stamp_ns > START + 2 * SECOND)
+    assert (late.prism_reason == Reason.VALID).all()
+
+
+def test_measurement_that_is_later_than_the_delay_changes_the_final_pose(scene: Scene) -> None:
+    """And not the pose that was sent before it arrived."""
+    measurements = every(scene, 9.0)
+    gap = [m for m in measurements if m.station == 2 and 4 * SECOND < m.stamp_ns - START < 5 * SECOND]
+    rest = [m for m in measurements if m not in gap]
+    late = [replace(m, received_ns=m.received_ns + 2 * SECOND) for m in gap]
+    without, filled = (with_delays(scene, (1.0,), some, 9.0)[1] for some in (rest, [*rest, *late]))
+    there = (START + 4.4 * SECOND, START + 4.9 * SECOND)
+    for delay_s, changes in ((1.0, False), (0.0, True)):
+        a, b = (delayed_of(each, delay_s) for each in (without, filled))
+        rows = (a.stamp_ns > there[0]) & (a.stamp_ns < there[1])
+        assert rows.sum() == 9
+        assert np.array_equal(a.covariance[rows], b.covariance[rows]) != changes
+
+
+def test_poses_at_delays_before_the_initialisation_are_invalid(scene: Scene) -> None:
+    """Two measurements of each prism allow a mirrored robot."""
+    measurements = every(scene, 6.0)
+    _, smoothed = with_delays(scene, (0.4,), measurements, 6.0)
+    twice_ns = max([m.stamp_ns for m in measurements if m.prism == prism][1] for prism in (1, 2, 3))
+    delayed = delayed_of(smoothed, 0.4)
+    assert delayed.valid.any()
+    assert delayed.stamp_ns[delayed.valid].min() >= twice_ns
 
 
 def test_poses_follow_the_robot(scene: Scene) -> None:

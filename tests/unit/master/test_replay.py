@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from harness.records import EVENT, HEADER, PARAMETERS, measurement, recording_bytes
@@ -20,20 +22,22 @@ from tsgt.simulation.kernel import VirtualClock
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from harness.scene import Scene
+
 SCENE = stationary_scene()
 
 
-def live_lines(path: Path, seconds: int = 3) -> list[bytes]:
+def live_lines(path: Path, seconds: int = 3, *, scene: Scene = SCENE) -> list[bytes]:
     """Record a short live run, as a master does; return the lines that its readers got."""
-    feed = LiveEstimator(SCENE.parameters)
+    feed = LiveEstimator(scene.parameters)
     lines: list[bytes] = []
     for step in range(seconds * 10):
         for station in (1, 2, 3):
-            lines += map(encode_line, feed.measurement(SCENE.measure(station, step / 10)))
+            lines += map(encode_line, feed.measurement(scene.measure(station, step / 10)))
     event = replace(EVENT, stamp_ns=START + seconds * 1_000_000_000 + 5_000_000_000)
     lines += [*map(encode_line, feed.advance(event.stamp_ns)), encode_line(event)]
     with RecordingWriter(path) as writer:
-        for line in (encode_line(HEADER), encode_line(SCENE.parameters), *lines):
+        for line in (encode_line(HEADER), encode_line(scene.parameters), *lines):
             writer.write_line(line)
     return lines
 
@@ -136,6 +140,36 @@ async def test_speed_changes_the_pace_only(tmp_path: Path, speed: float, lasts_s
     assert received[1:] == lines
     assert published == len(lines)
     assert (ended_ns - began_ns) / 1e9 == pytest.approx(lasts_s, abs=0.2)
+
+
+async def test_reader_tells_the_delays_apart(tmp_path: Path) -> None:
+    """Each epoch has one pose of each series, and each arrives when its delay has passed, before the next prediction."""
+    path = tmp_path / "run.jsonl"
+    delays_ns = {0.2: 200_000_000, 1.0: 1_000_000_000}
+    scene = SCENE.with_limits(estimator="continuous", smoothed_delays_ns=tuple(delays_ns.values()))
+    live_lines(path, scene=scene)
+    async with StreamServer(tmp_path / "poses.sock", b"{}") as server:
+        reader, writer = await asyncio.open_unix_connection(tmp_path / "poses.sock")
+        await server.wait_for_reader()
+        reading = asyncio.create_task(reader.read())
+        await replay(replayed(path), server, VirtualClock(0), speed=math.inf)
+        await server.finish()
+    poses = [json.loads(line) for line in (await reading).splitlines() if b'"type":"pose"' in line]
+    writer.close()
+    # A final pose has no key: its line is that of a stream without delays.
+    series = {(pose["kind"], pose.get("delay_s")) for pose in poses}
+    assert series == {("predicted", None), ("smoothed", None), ("smoothed", 0.2), ("smoothed", 1.0)}
+    waiting: list[dict[str, Any]] = []
+    seen = set()
+    for pose in poses:
+        assert (pose["kind"], pose.get("delay_s"), pose["stamp_ns"]) not in seen
+        seen.add((pose["kind"], pose.get("delay_s"), pose["stamp_ns"]))
+        if pose["kind"] == "predicted":
+            for each in waiting:
+                assert pose["stamp_ns"] - each["stamp_ns"] == delays_ns[each["delay_s"]]
+            waiting = []
+        elif "delay_s" in pose:
+            waiting.append(pose)
 
 
 def test_greeting_has_the_limits_of_the_first_session(tmp_path: Path) -> None:

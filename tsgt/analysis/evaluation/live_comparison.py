@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from tsgt.analysis.evaluation.streamed_poses import StreamedPoses
     from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters
-    from tsgt.recording import Kind, Recording
+    from tsgt.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)
 class LiveComparison:
-    """The poses of a stream by kind; ``against``: ``reference`` or ``post_processed``."""
+    """The poses of a stream by series; ``against``: ``reference`` or ``post_processed``."""
 
     against: str
-    kinds: dict[Kind, LivePoses]
+    series: dict[str, LivePoses]
 
     def keys(self) -> dict[str, Any]:
         """Return the figures for ``--json``."""
-        return {"against": self.against, **{kind: each.keys() for kind, each in self.kinds.items()}}
+        return {"against": self.against, **{name: each.keys() for name, each in self.series.items()}}
 
 
 def compare_live(
@@ -50,11 +50,11 @@ def compare_live(
     true = true.of_point(parameters.reference_point)
     return LiveComparison(
         "post_processed" if reference is None else "reference",
-        {kind: _compare(poses, kind, true, parameters) for kind, poses in streamed.items()},
+        {name: _compare(poses, name, true, parameters) for name, poses in streamed.items()},
     )
 
 
-def _compare(poses: StreamedPoses, kind: Kind, true: Reference, parameters: Parameters) -> LivePoses:
+def _compare(poses: StreamedPoses, series: str, true: Reference, parameters: Parameters) -> LivePoses:
     inner = interior_mask(poses.stamp_ns, int(true.stamp_ns[0]), int(true.stamp_ns[-1]))
     transforms, known = true.at(poses.stamp_ns)
     rows = inner & known
@@ -62,7 +62,7 @@ def _compare(poses: StreamedPoses, kind: Kind, true: Reference, parameters: Para
     errors = LivePoseErrors.of(
         estimated, poses.covariance[rows], poses.age_s[rows], transforms[rows], centroid_at_point(parameters)
     )
-    limits = sigma_limits_of(kind, parameters.pipeline)
+    limits = sigma_limits_of(series, parameters.pipeline)
     return LivePoses(poses.poses, len(poses.stamp_ns), poses.age_s, errors.statistics(*limits))
 
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 AGE_EDGES_MS = (0, 100, 200, 300, 400, 600, 1000, 2000, 3000, 3250, 3500, 4000, math.inf)
-"""Ages of predictions are fractions of a second, those of smoothed poses the lag (3 s) and up to half a second."""
+"""Ages of predictions are fractions of a second, those of smoothed poses their delay, or the lag (3 s) and up to half a
+second."""
 
 THREE_SIGMA_3D = (
     14.156  # Squared Mahalanobis distance that 0.27 % of three-dimensional Gaussian errors exceed

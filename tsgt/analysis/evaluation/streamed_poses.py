@@ -13,7 +13,7 @@ import numpy as np
 from tsgt.errors import CorruptLineError
 from tsgt.estimation import records_at
 from tsgt.model import Parameters
-from tsgt.recording import Kind, PoseRecord, decode_line, read_lines
+from tsgt.recording import PoseRecord, decode_line, read_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,7 +35,7 @@ class _Arrival:
 
 @dataclass(frozen=True, slots=True)
 class StreamedPoses:
-    """The poses of one kind; arrays of the N valid ones, in the order of the stream."""
+    """The poses of one series; arrays of the N valid ones, in the order of the stream."""
 
     poses: int  # valid or not
     stamp_ns: NDArray[np.int64]  # (N,)
@@ -54,8 +54,8 @@ def newest_age_s(pose: PoseRecord) -> float:
 
 def read_streamed_poses(
     path: Path, point: ReferencePoint, *, keep_going: bool = False
-) -> dict[Kind, StreamedPoses]:
-    """Read the poses of a recording, as those of a point of the robot; empty without poses.
+) -> dict[str, StreamedPoses]:
+    """Read the poses of a recording by series, as those of a point of the robot; empty without poses.
 
     ``keep_going``: skip lines that cannot be read instead of raising CorruptLineError; what
     :func:`~tsgt.recording.read_lines` raises.
@@ -80,12 +80,12 @@ class _Reader:
     def __init__(self, point: ReferencePoint) -> None:
         self._point = self._recorded_point = point
         self._now_ns = 0
-        self._counts: Counter[Kind] = Counter()
+        self._counts: Counter[str] = Counter()
         self._waiting: list[tuple[PoseRecord, float]] = []
         # Sent with the next predicted pose, whose stamp is the instant.
         self._unsent: list[PoseRecord] = []
-        self._stamps: defaultdict[Kind, array[int]] = defaultdict(lambda: array("q"))
-        self._numbers: defaultdict[Kind, array[float]] = defaultdict(lambda: array("d"))
+        self._stamps: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
+        self._numbers: defaultdict[str, array[float]] = defaultdict(lambda: array("d"))
 
     def start_session(self, point: ReferencePoint) -> None:
         self._send_all()
@@ -97,7 +97,7 @@ class _Reader:
         self._now_ns = max(self._now_ns, now_ns)
 
     def pose(self, pose: PoseRecord) -> None:
-        self._counts[pose.kind] += 1
+        self._counts[pose.series] += 1
         if pose.kind == "predicted":
             self.now(pose.stamp_ns)
             self._send_all()
@@ -111,15 +111,15 @@ class _Reader:
         if len(self._waiting) >= _CHUNK:
             self._store()
 
-    def finish(self) -> dict[Kind, StreamedPoses]:
+    def finish(self) -> dict[str, StreamedPoses]:
         self._send_all()
         self._store()
         found = {}
-        for kind, count in sorted(self._counts.items()):
-            numbers = np.array(self._numbers[kind]).reshape(-1, 44)
-            found[kind] = StreamedPoses(
+        for series, count in sorted(self._counts.items()):
+            numbers = np.array(self._numbers[series]).reshape(-1, 44)
+            found[series] = StreamedPoses(
                 poses=count,
-                stamp_ns=np.array(self._stamps[kind], dtype=np.int64),
+                stamp_ns=np.array(self._stamps[series], dtype=np.int64),
                 age_s=numbers[:, 0],
                 position_m=numbers[:, 1:4],
                 orientation_xyzw=numbers[:, 4:8],
@@ -138,8 +138,8 @@ class _Reader:
         for pose, (_, age_s) in zip(poses, self._waiting, strict=True):
             if pose.position_m is None or pose.orientation_xyzw is None or pose.covariance is None:
                 continue  # no program of ours writes such a valid pose
-            self._stamps[pose.kind].append(pose.stamp_ns)
-            self._numbers[pose.kind].extend(
+            self._stamps[pose.series].append(pose.stamp_ns)
+            self._numbers[pose.series].extend(
                 (age_s, *pose.position_m, *pose.orientation_xyzw, *pose.covariance)
             )
         self._waiting.clear()

@@ -11,9 +11,14 @@ if TYPE_CHECKING:
 
 _KINDS = {
     "predicted": "predicted (for now)",
-    "smoothed": "smoothed (some seconds late)",
+    "smoothed": "smoothed (final, some seconds late)",
     "interpolated": "interpolated",
 }
+
+
+def _label(series: str) -> str:
+    kind, _, delay = series.partition("_")
+    return f"{kind} ({delay} late)" if delay else _KINDS[kind]
 
 
 def live_section(found: LiveComparison | None, point: str) -> Section | None:
@@ -32,7 +37,7 @@ def live_section(found: LiveComparison | None, point: str) -> Section | None:
     )
     rows = [
         (
-            _KINDS.get(kind, kind),
+            _label(series),
             str(each.poses),
             format_share(each.keys()["valid_fraction"]),
             format_number(e.position_rms_mm),
@@ -42,7 +47,7 @@ def live_section(found: LiveComparison | None, point: str) -> Section | None:
             format_number(e.nees.mean),
             *(format_share(share, 2) for share in (e.beyond_limits.position, e.beyond_limits.rotation)),
         )
-        for kind, each in found.kinds.items()
+        for series, each in found.series.items()
         for e in (each.errors,)
     ]
     header = (
@@ -51,14 +56,14 @@ def live_section(found: LiveComparison | None, point: str) -> Section | None:
     )  # fmt: skip
     by_age = [
         (
-            _KINDS.get(kind, kind),
+            _label(series),
             f"{b.from_ms:g} to {b.to_ms:g}" if b.to_ms is not None else f"over {b.from_ms:g}",
             str(b.compared),
             *(format_number(value) for value in (b.position_rms_mm, b.position_median_mm, b.position_p95_mm)),
             format_number(b.orientation_rms_deg, 2),
             format_number(b.nees_mean),
         )
-        for kind, each in found.kinds.items()
+        for series, each in found.series.items()
         for b in each.errors.by_age
     ]
     tables = (

@@ -20,11 +20,11 @@ def print_live(found: LiveComparison, parameters: Parameters) -> None:
     point = parameters.reference_point.name
     click.echo(f"\nStreamed poses against {against}, at {point_label(parameters.reference_point)}")
     rows = []
-    for kind, each in found.kinds.items():
+    for series, each in found.series.items():
         keys, errors = each.keys(), each.errors
         rows.append(
             [
-                kind,
+                series,
                 str(each.poses),
                 f"{keys['valid_fraction']:.1%}",
                 *numbers(
@@ -56,13 +56,13 @@ def print_live(found: LiveComparison, parameters: Parameters) -> None:
     )
     rows = [
         [
-            kind,
+            series,
             f"{bin_.from_ms:g} to {bin_.to_ms:g}" if bin_.to_ms is not None else f"over {bin_.from_ms:g}",
             str(bin_.compared),
             *numbers(bin_.position_rms_mm, bin_.position_median_mm, bin_.position_p95_mm, digits=1),
             *numbers(bin_.orientation_rms_deg, bin_.nees_mean),
         ]
-        for kind, each in found.kinds.items()
+        for series, each in found.series.items()
         for bin_ in each.errors.by_age
     ]
     of_point = [f"{point} {figure} mm" for figure in ("rms", "median", "p95")]

@@ -33,7 +33,6 @@ from tsgt.simulation.options import SimulationOptions
 if TYPE_CHECKING:
     from tsgt.analysis.evaluation import LivePoses
     from tsgt.model import ReferencePoint
-    from tsgt.recording import Kind
     from tsgt.simulation.demo import DemoFiles
 
 DEFAULT_DURATION_S = 30.0
@@ -46,7 +45,7 @@ class Result:
     """Result of a demonstration."""
 
     poses: LivePoses  # the best that the estimator makes
-    live: dict[Kind, LivePoses]  # by kind
+    live: dict[str, LivePoses]  # by series
     restarts: int
     recording: Path | None
     reference_point: ReferencePoint
@@ -104,7 +103,7 @@ def demo(
             {
                 **{name: value for name, value in result.poses.keys().items() if name in _HEADLINE},
                 "reference_point": dataclasses.asdict(result.reference_point),
-                "live": {kind: each.keys() for kind, each in result.live.items()},
+                "live": {series: each.keys() for series, each in result.live.items()},
                 "socket": str(socket_path),
                 "recording": None if result.recording is None else str(result.recording),
                 "folder": str(folder),
@@ -122,11 +121,11 @@ def demo(
             f"{errors.centroid.position_rms_mm:.1f} mm at the centroid of the prisms"
         )
         click.echo(f"orientation  {errors.orientation_rms_deg:.2f} deg rms error")
-    for kind, live in result.live.items():
+    for series, live in result.live.items():
         keys = live.keys()
-        age = "newest measurement" if kind == "predicted" else "sent"
+        age = "newest measurement" if series == "predicted" else "sent"
         click.echo(
-            f"{kind:<12} {keys['valid_fraction']:.0%} valid, {age} {keys['age_ms']['p50']:.0f} ms old (median), rms errors "
+            f"{series:<12} {keys['valid_fraction']:.0%} valid, {age} {keys['age_ms']['p50']:.0f} ms old (median), rms errors "
             f"{live.errors.position_rms_mm:.1f} mm at {at} and {live.errors.orientation_rms_deg:.2f} deg"
         )
     click.echo(f"files        {folder}: configuration, logs, journals")
@@ -157,8 +156,8 @@ def _run(
 
     demo, progress = service.run(run)
     return Result(
-        poses=progress.live_poses(progress.kind),
-        live={kind: progress.live_poses(kind) for kind in sorted(progress.poses)},
+        poses=progress.live_poses(progress.best),
+        live={series: progress.live_poses(series) for series in sorted(progress.poses)},
         restarts=sum(max(0, process.starts - 1) for process in demo.processes),
         recording=_kept(sorted(files.recordings.glob("*.jsonl")), output),
         reference_point=demo.parameters.reference_point,

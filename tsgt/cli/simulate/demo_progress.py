@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from rich.live import Live
 
     from tsgt.clock import UnixTimeline
-    from tsgt.recording import Kind
     from tsgt.simulation.demo import Demo
 
 PRINT_INTERVAL_S = 5.0
@@ -36,7 +35,7 @@ _BATCH_POSES = 100
 
 @dataclass(slots=True)
 class _ValidPoses:
-    """Valid poses of one kind: the newest, those to compare with the truth, and the errors of the others."""
+    """Valid poses of one series: the newest, those to compare with the truth, and the errors of the others."""
 
     newest: PoseRecord | None = None
     waiting: list[tuple[PoseRecord, float]] = field(default_factory=list)  # with their ages in s
@@ -55,7 +54,7 @@ class Progress:
     Attributes
     ----------
     poses
-        Number of poses by kind, valid or not.
+        Number of poses by series, valid or not.
     first_ns, last_ns
         Unix time of the first and the last pose in ns; 0 before.
     """
@@ -64,11 +63,11 @@ class Progress:
         self._demo = demo
         self._timeline = timeline
         self._start_ns = timeline.unix_ns(demo.start_ns)
-        self._valid: defaultdict[Kind, _ValidPoses] = defaultdict(_ValidPoses)
+        self._valid: defaultdict[str, _ValidPoses] = defaultdict(_ValidPoses)
         self._live: Live | None = None
         self._printed_at_s = 0.0
         self._starts = 0
-        self.poses: Counter[Kind] = Counter()
+        self.poses: Counter[str] = Counter()
         self.first_ns = 0
         self.last_ns = 0
 
@@ -97,29 +96,29 @@ class Progress:
             self._print(f"event  {event.event}: {event.message}")
 
     @property
-    def kind(self) -> Kind:
-        """The kind of poses to report: the best that the estimator makes."""
+    def best(self) -> str:
+        """The series of poses to report: the best that the estimator makes."""
         return "smoothed" if self.poses["predicted"] else "interpolated"
 
-    def live_poses(self, kind: Kind) -> LivePoses:
-        """Return the poses of a kind so far, with the errors of the valid ones, without 2 s at both ends."""
-        stamps_ns, errors = self._compared(kind)
+    def live_poses(self, series: str) -> LivePoses:
+        """Return the poses of a series so far, with the errors of the valid ones, without 2 s at both ends."""
+        stamps_ns, errors = self._compared(series)
         inner = interior_mask(stamps_ns, self.first_ns, self.last_ns)
-        limits = sigma_limits_of(kind, self._demo.parameters.pipeline)
+        limits = sigma_limits_of(series, self._demo.parameters.pipeline)
         return LivePoses(
-            self.poses[kind], len(stamps_ns), errors.age_s, errors.select(inner).statistics(*limits)
+            self.poses[series], len(stamps_ns), errors.age_s, errors.select(inner).statistics(*limits)
         )
 
-    def _compared(self, kind: Kind) -> tuple[NDArray[np.int64], LivePoseErrors]:
-        """Return stamps and errors of all valid poses of a kind, in the order of the stream."""
-        self._compare_waiting(kind)
-        valid = self._valid[kind]
+    def _compared(self, series: str) -> tuple[NDArray[np.int64], LivePoseErrors]:
+        """Return stamps and errors of all valid poses of a series, in the order of the stream."""
+        self._compare_waiting(series)
+        valid = self._valid[series]
         valid.errors = [LivePoseErrors.concatenated(valid.errors)]
         return np.array(valid.stamps_ns, dtype=np.int64), valid.errors[0]
 
-    def _compare_waiting(self, kind: Kind) -> None:
+    def _compare_waiting(self, series: str) -> None:
         """Compare the waiting poses with the truth."""
-        valid = self._valid[kind]
+        valid = self._valid[series]
         waiting, valid.waiting = valid.waiting, []
         poses = [pose for pose, _ in waiting]
         stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
@@ -140,14 +139,14 @@ class Progress:
     def _pose(self, pose: PoseRecord) -> None:
         self.first_ns = self.first_ns or pose.stamp_ns
         self.last_ns = max(self.last_ns, pose.stamp_ns)
-        self.poses[pose.kind] += 1
+        self.poses[pose.series] += 1
         if pose.valid:
-            valid = self._valid[pose.kind]
+            valid = self._valid[pose.series]
             valid.newest = pose
             sent_s = (self._timeline.unix_ns(time.monotonic_ns()) - pose.stamp_ns) / 1e9
             valid.waiting.append((pose, newest_age_s(pose) if pose.kind == "predicted" else sent_s))
             if len(valid.waiting) == _BATCH_POSES:
-                self._compare_waiting(pose.kind)
+                self._compare_waiting(pose.series)
 
     def _status(self, status: StatusRecord) -> None:
         starts = sum(process.starts for process in self._demo.processes)
@@ -160,17 +159,17 @@ class Progress:
             return
         self._printed_at_s = now_s
         elapsed_s = (status.stamp_ns - self._start_ns) / 1e9
-        newest = self._valid[self.kind].newest
+        newest = self._valid[self.best].newest
         text = f"{elapsed_s:5.0f} s"
         at = point_label(self._demo.parameters.reference_point)
         if newest is not None:
             position = " ".join(f"{value:6.2f}" for value in newest.position_m or ())
             text += f"  {at} at {position} m"
         lines = [text]
-        for kind in sorted(self.poses):
-            keys = self.live_poses(kind).keys()
-            line = f"         {kind:<12} {keys['valid_poses']}/{keys['poses']} poses valid  "
-            line += f"{'newest measurement' if kind == 'predicted' else 'sent'} {keys['age_ms']['p50']:.0f} ms old"
+        for series in sorted(self.poses):
+            keys = self.live_poses(series).keys()
+            line = f"         {series:<12} {keys['valid_poses']}/{keys['poses']} poses valid  "
+            line += f"{'newest measurement' if series == 'predicted' else 'sent'} {keys['age_ms']['p50']:.0f} ms old"
             if math.isfinite(keys["position_rms_mm"]):
                 line += f"  rms error {keys['position_rms_mm']:.1f} mm at {at}, {keys['orientation_rms_deg']:.2f} deg"
             lines.append(line)

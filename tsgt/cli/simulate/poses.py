@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.model import Measurement
-    from tsgt.recording import Kind
     from tsgt.simulation.mission import MissionResult
 
 
@@ -47,7 +46,7 @@ class EstimatorFigures:
 def pose_keys(run: MissionResult) -> dict[str, Any]:
     """Return all figures for ``--json``."""
     inter_prism_mean_mm = _inter_prism_mean_mm(run)
-    live = {kind: found.keys() for kind, found in live_figures(run).items()}
+    live = {series: found.keys() for series, found in live_figures(run).items()}
     return {
         "reference_point": dataclasses.asdict(run.parameters.reference_point),
         "estimators": {
@@ -55,7 +54,7 @@ def pose_keys(run: MissionResult) -> dict[str, Any]:
             for name, found in estimator_figures(run).items()
         },
         "live": live,
-        "nees": {kind: found["nees"] for kind, found in live.items()},
+        "nees": {series: found["nees"] for series, found in live.items()},
     }
 
 
@@ -102,22 +101,22 @@ def _processed_figures(run: MissionResult, recording: Recording) -> EstimatorFig
     )
 
 
-def live_figures(run: MissionResult) -> dict[Kind, LivePoses]:
-    """Compare the streamed poses with the truth, by kind."""
-    counts: Counter[Kind] = Counter()
+def live_figures(run: MissionResult) -> dict[str, LivePoses]:
+    """Compare the streamed poses with the truth, by series."""
+    counts: Counter[str] = Counter()
     for session in run.master_logs:
         counts.update(session.pose_counts)
     streamed = [session.valid_poses() for session in run.master_logs]
     found = {}
-    for kind, count in sorted(counts.items()):
-        some = [poses.select(poses.kind == kind) for poses in streamed]
+    for series, count in sorted(counts.items()):
+        some = [poses.select(poses.series == series) for poses in streamed]
         stamp_ns = np.concatenate(
             [
                 poses.stamp_ns + run.start_ns - session.unix_at_zero_ns
                 for session, poses in zip(run.master_logs, some, strict=True)
             ]
         )
-        age_name = "newest_age_s" if kind == "predicted" else "sent_age_s"
+        age_name = "newest_age_s" if series == "predicted" else "sent_age_s"
         names = ("position_m", "orientation_xyzw", "covariance", age_name)
         position_m, orientation_xyzw, covariance, age_s = (
             np.concatenate([getattr(poses, name) for poses in some]) for name in names
@@ -130,8 +129,8 @@ def live_figures(run: MissionResult) -> dict[Kind, LivePoses]:
             run.true_poses((stamp_ns[inner] - run.start_ns) / 1e9),
             centroid_at_point(run.parameters),
         )
-        limits = sigma_limits_of(kind, run.parameters.pipeline)
-        found[kind] = LivePoses(count, len(stamp_ns), age_s, errors.statistics(*limits))
+        limits = sigma_limits_of(series, run.parameters.pipeline)
+        found[series] = LivePoses(count, len(stamp_ns), age_s, errors.statistics(*limits))
     return found
 
 

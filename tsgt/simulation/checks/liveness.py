@@ -69,7 +69,9 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
             )
     yield from missing_acknowledgements(result, indices)
     poses = master_log.valid_poses()
-    at_s = (poses.stamp_ns[poses.kind != "predicted"] - master_log.unix_at_zero_ns) / 1e9
+    at_s = (
+        poses.stamp_ns[np.isin(poses.series, ("interpolated", "smoothed"))] - master_log.unix_at_zero_ns
+    ) / 1e9
     valid = np.count_nonzero((from_s <= at_s) & (at_s < to_s))
     expected = seconds * 1e9 / result.parameters.pipeline.period_ns
     if valid < MIN_VALID_SHARE[protocol] * expected:

@@ -44,7 +44,7 @@ def pose_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]
 def refit_mismatches(master_log: MasterLog, parameters: Parameters) -> Iterator[str]:
     """Refit each valid pose of the estimator ``linear`` from usable measurements and compare the residual."""
     poses = master_log.valid_poses()
-    poses = poses.select(poses.kind == "interpolated")
+    poses = poses.select(poses.series == "interpolated")
     tracks = build_tracks(parameters, [m for m in master_log.measurements if usable(m)])
     mismatched = np.flatnonzero(~_matches_refit(poses, slice(None), tracks, parameters))
     stamps_ns = np.array([m.stamp_ns for m in master_log.measurements], dtype=np.int64)
@@ -64,12 +64,12 @@ def refit_mismatches(master_log: MasterLog, parameters: Parameters) -> Iterator[
 def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
     """Compare each valid pose of the estimator ``continuous`` with the truth and its covariance (NEES)."""
     poses = master_log.valid_poses()
-    poses = poses.select(poses.kind != "interpolated")
+    poses = poses.select(poses.series != "interpolated")
     errors, nees = _errors(poses, master_log, result)
     error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
     for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms.max(axis=1) > _STATE_TOLERANCE)).tolist():
         yield (
-            f"{poses.kind[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "
+            f"{poses.series[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "
             f"{error_norms[index, 1]:.4f} rad, limit {_STATE_TOLERANCE:g}; NEES {nees[index]:.0f}, limit {_MAX_NEES:g}"
         )
 
@@ -84,20 +84,20 @@ def distribution_failures(master_log: MasterLog, result: MissionResult) -> Itera
     if any(station_log.folder is None for station_log in result.station_logs.values()):
         return
     every = master_log.valid_poses()
-    for kind in ("interpolated", "predicted", "smoothed"):
-        poses = every.select(every.kind == kind)
+    for series in np.unique(every.series).tolist():
+        poses = every.select(every.series == series)
         if len(poses.stamp_ns) < _MIN_POSES:
             continue
         errors, nees = _errors(poses, master_log, result)
         median_nees = np.median(nees)
         median_m, median_rad = np.linalg.norm(np.median(errors, axis=0).reshape(2, 3), axis=1)
-        if kind != "predicted" and max(median_m, median_rad) > _MAX_MEDIAN_ERROR:
+        if series in ("interpolated", "smoothed") and max(median_m, median_rad) > _MAX_MEDIAN_ERROR:
             yield (
-                f"{len(nees)} {kind} poses: median error {median_m:.4f} m at the prisms' centroid and {median_rad:.4f} rad, "
+                f"{len(nees)} {series} poses: median error {median_m:.4f} m at the prisms' centroid and {median_rad:.4f} rad, "
                 f"limit {_MAX_MEDIAN_ERROR:g}"
             )
         if median_nees > _MAX_MEDIAN_NEES:
-            yield f"{len(nees)} {kind} poses: median NEES {median_nees:.1f}, limit {_MAX_MEDIAN_NEES:g}"
+            yield f"{len(nees)} {series} poses: median NEES {median_nees:.1f}, limit {_MAX_MEDIAN_NEES:g}"
 
 
 def _errors(

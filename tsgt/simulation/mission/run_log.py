@@ -6,13 +6,13 @@ from array import array
 from collections import Counter
 from dataclasses import dataclass, field, fields
 from itertools import combinations
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.estimation import transform_of
 from tsgt.model import PolarMeasurement
-from tsgt.recording import BeaconRecord, ClockRecord, Kind, PoseRecord, StatusRecord, decode_line, read_lines
+from tsgt.recording import BeaconRecord, ClockRecord, PoseRecord, StatusRecord, decode_line, read_lines
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
 from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
 from tsgt.station.leica import LeicaInstrument
@@ -44,8 +44,6 @@ _MAX_DISAGREEMENT_US = 20_000
 # A restarted station accepts a journalled clock offset based on five beacons; some may have been outliers.
 _MIN_RECEPTIONS = 8
 
-_KINDS: tuple[Kind, ...] = get_args(Kind)
-
 
 @dataclass(frozen=True, slots=True)
 class ValidPoses:
@@ -56,7 +54,7 @@ class ValidPoses:
     orientation_xyzw: NDArray[np.float64]  # (N, 4)
     residual_m: NDArray[np.float64]  # (N,) as published
     measurements_before: NDArray[np.int64]  # (N,) number of measurements published before each pose
-    kind: NDArray[np.str_]  # (N,) kind of pose, as published
+    series: NDArray[np.str_]  # (N,) name of the series, as published: kind, with the delay if there is one
     newest_age_s: NDArray[np.float64]  # (N,) age of the newest measurement
     sent_age_s: NDArray[np.float64]  # (N,) age of the pose when it was published
     covariance: NDArray[np.float64]  # (N, 6, 6) as published
@@ -96,14 +94,15 @@ class MasterLog:
         self.arrived_ns: list[int] = []  # True time of each measurement's publication, in ns from the start
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
-        self.pose_counts: Counter[Kind] = Counter()  # number of poses, valid or not, by kind
+        self.pose_counts: Counter[str] = Counter()  # number of poses, valid or not, by series
         self.frame_count = 0
         self.frames_duration_ns = 0
         self._first_beacon: BeaconRecord | None = None
         self.line_hashes = array("q")
         self._pose_stamps = array("q")
         self._pose_measurements_before = array("q")
-        self._pose_kinds = array("b")
+        self._series: dict[str, int] = {}
+        self._pose_series = array("b")
         self._pose_numbers = array("d")
         self._pose_sent_ages_s = array("d")
 
@@ -118,7 +117,7 @@ class MasterLog:
         elif isinstance(record, StatusRecord):
             self.statuses.append(record)
         elif isinstance(record, PoseRecord):
-            self.pose_counts[record.kind] += 1
+            self.pose_counts[record.series] += 1
             if record.valid:
                 self._observe_pose(record)
         elif isinstance(record, BeaconRecord):
@@ -139,7 +138,7 @@ class MasterLog:
         self._pose_numbers.append(min(ages_s, default=np.nan))
         self._pose_sent_ages_s.append((self._now_ns() + self.unix_at_zero_ns - pose.stamp_ns) / 1e9)
         self._pose_numbers.extend(pose.covariance or ())
-        self._pose_kinds.append(_KINDS.index(pose.kind))
+        self._pose_series.append(self._series.setdefault(pose.series, len(self._series)))
 
     def valid_poses(self) -> ValidPoses:
         """Return the valid poses published so far."""
@@ -150,7 +149,7 @@ class MasterLog:
             orientation_xyzw=numbers[:, 3:7],
             residual_m=numbers[:, 7],
             measurements_before=np.array(self._pose_measurements_before, dtype=np.int64),
-            kind=np.array(_KINDS)[np.array(self._pose_kinds, dtype=np.intp)],
+            series=np.array([*self._series], dtype=np.str_)[np.array(self._pose_series, dtype=np.intp)],
             newest_age_s=numbers[:, 8],
             sent_age_s=np.array(self._pose_sent_ages_s),
             covariance=numbers[:, 9:].reshape(-1, 6, 6),

@@ -113,6 +113,23 @@ def test_ages_follow_from_the_order_of_the_stream(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["smoothed"].age_s, 3.0)
 
 
+def test_poses_at_a_delay_are_a_series_of_their_own(tmp_path: Path) -> None:
+    """Their errors are not mixed with those of the final poses."""
+    path = tmp_path / "r.jsonl"
+    stream(path)
+    stamp_ns = measurement(0).received_ns + 5 * PERIOD_NS
+    predicted = replace(POSE, stamp_ns=stamp_ns, kind="predicted", estimator="continuous")
+    delayed = replace(predicted, stamp_ns=stamp_ns - 600_000_000, kind="smoothed", delay_s=0.6)
+    path.write_bytes(path.read_bytes() + b"".join(encode_line(each) + b"\n" for each in (delayed, predicted)))
+    found = read_streamed_poses(path, ROBOT_ORIGIN)
+    assert {series: each.poses for series, each in found.items()} == {
+        "predicted": 5,
+        "smoothed": 2,
+        "smoothed_0.6s": 1,
+    }
+    np.testing.assert_allclose(found["smoothed_0.6s"].age_s, 0.6)
+
+
 def test_poses_are_those_of_the_point(tmp_path: Path) -> None:
     """They were recorded at the robot's origin."""
     stream(tmp_path / "r.jsonl")

@@ -1,0 +1,79 @@
+"""Errors and NEES of live poses by the delay at which they are sent: predicted at once, smoothed at delays, and final.
+
+Runs the live estimator over the measurements of simulated recordings and compares its valid poses with the truth, from 10 s
+after the start to 5 s before the end.
+
+    tsgt simulate dynamic --duration 300 --seed 31 --output dynamic.jsonl --truth dynamic.tum
+    python benchmarks/run.py pose_delays dynamic.jsonl dynamic.tum [ANOTHER.jsonl ANOTHER.tum ...]
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tsgt.analysis.evaluation import LivePoseErrors, read_tum
+from tsgt.estimation import LiveEstimator, centroid_at_point
+from tsgt.geometry import rotation_from_quaternion, transform_from
+from tsgt.recording import PoseRecord, load_recording
+
+DELAYS_S = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0)
+FROM_NS, BEFORE_NS = 10_000_000_000, 5_000_000_000
+
+
+def live_poses(recording: Path) -> dict[str, list[PoseRecord]]:
+    """Return the poses of the live estimator by series."""
+    loaded = load_recording(recording)
+    delays_ns = tuple(round(1e9 * delay_s) for delay_s in DELAYS_S)
+    pipeline = replace(loaded.parameters.pipeline, smoothed_delays_ns=delays_ns)
+    estimator = LiveEstimator(replace(loaded.parameters, pipeline=pipeline))
+    found: defaultdict[str, list[PoseRecord]] = defaultdict(list)
+    for measurement in loaded.measurements:
+        for record in estimator.measurement(measurement):
+            if isinstance(record, PoseRecord):
+                found[record.series].append(record)
+    return found
+
+
+def print_errors(recording: Path, truth: Path) -> None:
+    """Print a table of one recording."""
+    parameters = load_recording(recording).parameters
+    reference = read_tum(truth).of_point(parameters.reference_point)
+    from_ns, until_ns = int(reference.stamp_ns[0]) + FROM_NS, int(reference.stamp_ns[-1]) - BEFORE_NS
+    print(recording.name)
+    for series, every in sorted(live_poses(recording).items()):
+        poses = [pose for pose in every if from_ns <= pose.stamp_ns <= until_ns]
+        valid = [pose for pose in poses if pose.valid]
+        if not valid:
+            print(f"{series:>14}: none of {len(poses)} valid")
+            continue
+        stamp_ns = np.array([pose.stamp_ns for pose in valid])
+        rotation = rotation_from_quaternion(np.array([pose.orientation_xyzw for pose in valid]))
+        errors = LivePoseErrors.of(
+            transform_from(rotation, np.array([pose.position_m for pose in valid])),
+            np.array([pose.covariance for pose in valid]).reshape(-1, 6, 6),
+            np.zeros(len(valid)),
+            reference.at(stamp_ns)[0],
+            centroid_at_point(parameters),
+        )
+        found = errors.statistics(None, None)
+        print(
+            f"{series:>14}: {len(valid) / len(poses):6.1%} valid, origin {found.position_rms_mm:5.2f} mm rms "
+            f"(p95 {found.position_p95_mm:5.2f}), centroid {found.centroid.position_rms_mm:5.2f} mm, "
+            f"{found.orientation_rms_deg:.3f} deg, NEES {found.nees.mean:.2f} (6), above 22.5 in 1000: "
+            f"{1e3 * np.mean(errors.nees > 22.46):.2f}, largest {errors.nees.max():.0f}"
+        )
+
+
+def main() -> None:
+    """Print the tables of all recordings."""
+    for recording, truth in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
+        print_errors(Path(recording), Path(truth))
+
+
+if __name__ == "__main__":
+    main()

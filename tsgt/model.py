@@ -595,6 +595,8 @@ class SetupCovariance(FiniteNumbers):
 class Parameters:
     """Every parameter in force: what post-processing a recording needs."""
 
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu"})
+
     type: Literal["parameters"] = "parameters"
     stations: tuple[StationParameters, ...]
     """One entry per station."""
@@ -606,3 +608,5 @@ class Parameters:
     """The frame on the robot whose pose is exported."""
     setup_covariance: SetupCovariance | None = None
     """Uncertainty of station frames, latencies, instrument errors and prisms; null where unknown: taken as exact."""
+    imu: ImuParameters | None = None
+    """The robot's IMU; absent where none is configured."""

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from tsgt.radio import Direction, Packet, Radio, RadioOpener
     from tsgt.radio.superframe import BeaconReception
     from tsgt.recording.journal import InstrumentRecord
+    from tsgt.service import StartProgram
     from tsgt.station import Atmosphere
 
 T = TypeVar("T")
@@ -377,6 +378,7 @@ class Field:
         open_radio: RadioOpener | None = None,
         clock: Clock = TRUE,
         key: bytes | None = KEY,
+        start_imu: StartProgram | None = None,
     ) -> None:
         """Run the master until cancelled; published records are appended to :attr:`records`."""
         await run_master(
@@ -388,6 +390,7 @@ class Field:
                 clock=clock,
                 key=key,
                 random_bits=lambda bits: int(self.rng.integers(1 << bits)),
+                start_imu=start_imu,
                 observe=lambda record, _line: self.records.append(record),
             ),
         )

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from tsgt.config import IMU_NOISE
 from tsgt.model import (
     ClockSample,
+    ImuParameters,
+    ImuSamples,
     Parameters,
     PointMeasurement,
     PolarMeasurement,
@@ -15,6 +18,7 @@ from tsgt.recording import (
     ClockRecord,
     EventRecord,
     HelloRecord,
+    ImuStatus,
     PoseRecord,
     RecordingHeader,
     StationShare,
@@ -111,6 +115,38 @@ def measurement(sequence: int) -> PolarMeasurement:
         zenith_angle_rad=1.5,
         slope_distance_m=30.0 + sequence / 3,
         host_time_ns=stamp_ns,
+    )
+
+
+IMU_PARAMETERS = ImuParameters(
+    position_m=(0.1, 0.0, 0.5),
+    orientation_xyzw=(0.0, 0.0, 0.0, 1.0),
+    noise=IMU_NOISE["industrial"],
+)
+IMU_STATUS = ImuStatus(
+    device="Acme 7",
+    samples=2000,
+    rate_hz=199.9,
+    age_s=0.04,
+    gaps=1,
+    lost=3,
+    saturated=0,
+    clock_skew_ppm=-12.5,
+    problem="",
+)
+
+
+def imu_samples(sequence: int, count: int = 10) -> ImuSamples:
+    """Return samples of an IMU at rest, 5 ms apart."""
+    stamps = tuple(START + (sequence + i) * 5_000_000 for i in range(count))
+    return ImuSamples(
+        sequence=sequence,
+        received_ns=stamps[-1] + 1_000_000,
+        stamp_ns=stamps,
+        duration_ns=(5_000_000,) * count,
+        instrument_time_ns=None,
+        angular_rate_radps=tuple((1e-6 * i, 0.0, 0.1) for i in range(count)),
+        specific_force_mps2=((0.0, 0.0, 9.81),) * count,
     )
 
 

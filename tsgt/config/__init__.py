@@ -31,6 +31,7 @@ from tsgt.config.files import (
     load,
     load_any,
 )
+from tsgt.config.imu import IMU_NOISE, ImuConfig, ImuNoiseConfig, normal_gravity_mps2
 from tsgt.config.master import (
     FrameWatchConfig,
     GeofenceConfig,
@@ -69,6 +70,7 @@ from tsgt.config.scenario_imu import ImuModelName, ImuSetupErrorConfig, ShakingC
 from tsgt.config.setup import PrismLayoutFile, StationFramesFile
 
 __all__ = [
+    "IMU_NOISE",
     "KINDS",
     "MAX_STATION_NUMBERS",
     "Baud",
@@ -79,7 +81,9 @@ __all__ = [
     "FrameWatchConfig",
     "GeofenceConfig",
     "HardwareRadioConfig",
+    "ImuConfig",
     "ImuModelName",
+    "ImuNoiseConfig",
     "ImuSetupErrorConfig",
     "InstrumentConfig",
     "InstrumentModelConfig",
@@ -125,6 +129,7 @@ __all__ = [
     "load_prism_layout",
     "load_station_calibration",
     "noise",
+    "normal_gravity_mps2",
     "parameters",
     "scenario_parameters",
     "setup_covariance",

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, unique_by
+from tsgt.config.imu import ImuConfig
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import MasterProtocolConfig, RadioConfig, check_numbers
 from tsgt.polygon import check_simple
@@ -120,6 +121,8 @@ class MasterConfig(Model):
     """Estimator and limits."""
     reference_point: ReferencePointConfig = ReferencePointConfig()
     """Reference point of the poses: the robot frame by default."""
+    imu: ImuConfig | None = None
+    """The robot's IMU, if it has one."""
     frame_watch: FrameWatchConfig = FrameWatchConfig()
     """Layout monitor."""
     geofences: Annotated[tuple[GeofenceConfig, ...], unique_by("name")] = ()

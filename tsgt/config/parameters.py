@@ -80,6 +80,7 @@ def parameters(config: MasterConfig) -> Parameters:
             station_numbers=(station.station for station in config.stations),
             prism_numbers=tracked,
         ),
+        imu=None if config.imu is None else config.imu.parameters(),
     )
 
 

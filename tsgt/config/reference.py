@@ -65,6 +65,7 @@ def _inner_models(
     (numbered,) = field.get("patternProperties", {"": {}}).values()
     for place, name in (
         (field, f"[{path}]"),
+        (field.get("anyOf", [{}])[0], f"[{path}]"),
         (field.get("items", {}), f"[[{path}]]"),
         (numbered, f"[{path}.NUMBER]"),
     ):

@@ -20,6 +20,7 @@ from tsgt.clock import UnixTimeline
 from tsgt.config import ClassicMasterConfig
 from tsgt.errors import RadioError, StreamError
 from tsgt.estimation import LiveEstimator
+from tsgt.imu import Imu
 from tsgt.master.classic import ClassicLink
 from tsgt.master.geofence import Geofence, run_geofence_command
 from tsgt.master.layout_monitor import LayoutMonitor
@@ -31,6 +32,7 @@ from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
 from tsgt.master.superframe import SuperframeLink
+from tsgt.model import ImuSamples
 from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import (
     EventRecord,
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
     from tsgt.master.link_events import LinkStatus
     from tsgt.model import Measurement, Parameters
     from tsgt.radio import LoRaSettings, Radio, RadioOpener
+    from tsgt.service import StartProgram
 
 STATUS_PERIOD_NS = 1_000_000_000
 
@@ -73,6 +76,8 @@ class MasterDependencies:
     """Returns a random number of this many bits, for nonces."""
     observe: Callable[[object, bytes], None] = lambda _record, _line: None
     """Called with each published record and its line."""
+    start_imu: StartProgram | None = None
+    """Starts the program that reads the IMU; None: as a child process."""
     write: Callable[[int, memoryview], int] | None = None  # see :class:`~tsgt.recording.RecordingWriter`
 
 
@@ -107,7 +112,8 @@ async def run_master(
             if isinstance(record, EventRecord):
                 log.info("stream_event", name=record.event, message=record.message)
             recording.put(line)
-            server.publish(line)
+            if not isinstance(record, ImuSamples):  # raw samples are for post-processing
+                server.publish(line)
             dependencies.observe(record, line)
 
         try:
@@ -125,7 +131,8 @@ async def run_master(
                     lambda: timeline.unix_ns(clock.monotonic_ns()),
                 )
                 link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)
-                master = _Master(clock, timeline, publisher, link)
+                imu = _imu(config, timeline, publisher, dependencies)
+                master = _Master(clock, timeline, publisher, link, imu)
                 log.info("master_started", recording=str(path), stations=len(config.stations))
                 service.sd_notify("READY=1")
                 group.create_task(recording.run())
@@ -135,6 +142,8 @@ async def run_master(
                 group.create_task(master.publish_due_poses())
                 group.create_task(master.publish_status())
                 group.create_task(master.notify_watchdog())
+                if imu is not None:
+                    group.create_task(imu.run())
                 radio_opener = master.with_radio_events(dependencies.open_radio)
                 group.create_task(supervise_radio(radio_opener, link.run, clock))
         finally:
@@ -186,14 +195,32 @@ def _link(
     )
 
 
+def _imu(
+    config: MasterConfig, timeline: UnixTimeline, publisher: Publisher, dependencies: MasterDependencies
+) -> Imu | None:
+    if config.imu is None:
+        return None
+    return Imu(
+        config.imu,
+        dependencies.clock,
+        timeline,
+        on_samples=publisher.imu_samples,
+        on_event=lambda event, message: publisher.report(MasterEvent(event, message)),
+        start=dependencies.start_imu,
+    )
+
+
 class _Master:
     """The tasks of the master."""
 
-    def __init__(self, clock: Clock, timeline: UnixTimeline, publisher: Publisher, link: Link) -> None:
+    def __init__(
+        self, clock: Clock, timeline: UnixTimeline, publisher: Publisher, link: Link, imu: Imu | None
+    ) -> None:
         self._clock = clock
         self._timeline = timeline
         self._publisher = publisher
         self._link = link
+        self._imu = imu
         self._radio_failed = False
 
     def _now_ns(self) -> int:
@@ -217,7 +244,9 @@ class _Master:
             next_ns = max(next_ns + STATUS_PERIOD_NS, self._clock.monotonic_ns())
             await self._clock.sleep_until(next_ns)
             status = self._publisher.publish_status(
-                self._link.status(), realtime_ns=self._clock.realtime_ns()
+                self._link.status(),
+                None if self._imu is None else self._imu.status(),
+                realtime_ns=self._clock.realtime_ns(),
             )
             received = sum(s.last_heard_s is not None and s.last_heard_s < 5 for s in status.stations)
             service.sd_notify(

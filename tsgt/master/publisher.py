@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from tsgt.master.station_events import StationEventDetector
     from tsgt.master.statistics import Statistics
-    from tsgt.model import Measurement, Parameters
-    from tsgt.recording import BeaconRecord, ClockRecord, StatusRecord
+    from tsgt.model import ImuSamples, Measurement, Parameters
+    from tsgt.recording import BeaconRecord, ClockRecord, ImuStatus, StatusRecord
 
 
 class Observer:
@@ -106,17 +106,23 @@ class Publisher:
             case link_events.MasterEvent(name, message):
                 self.put(EventRecord(stamp_ns=now_ns, event=name, message=message))
 
-    def publish_status(self, link: link_events.LinkStatus, *, realtime_ns: int) -> StatusRecord:
+    def publish_status(
+        self, link: link_events.LinkStatus, imu: ImuStatus | None = None, *, realtime_ns: int
+    ) -> StatusRecord:
         """Publish the events of expired time-outs and a status record; ``realtime_ns`` is the machine's Unix clock."""
         now_ns = self._now_ns()
         self._put_all(self._detector.tick(now_ns, realtime_ns=realtime_ns))
-        status = self._statistics.status(now_ns, link)
+        status = self._statistics.status(now_ns, link, imu)
         self.put(status)
         return status
 
     def measurement(self, measurement: Measurement) -> None:
         """Publish a measurement and the poses that it completes."""
         self._send(self._estimator.measurement(measurement), measurement.received_ns)
+
+    def imu_samples(self, samples: ImuSamples) -> None:
+        """Record samples of the IMU, in the order of arrival among all other lines."""
+        self._emit(samples, encode_line(samples))
 
     def put(self, record: StatusRecord | EventRecord | ClockRecord | BeaconRecord) -> None:
         """Publish a record after the poses that are due by its stamp."""

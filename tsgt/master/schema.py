@@ -13,12 +13,10 @@ import inspect
 import itertools
 import json
 import operator
-import typing
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
-from pydantic.fields import FieldInfo
 
 from tsgt import model, recording
 from tsgt.recording import journal
@@ -39,6 +37,7 @@ PAGES: dict[Path, tuple[type, ...]] = {
         recording.BeaconRecord,
         recording.StatusRecord,
         recording.StationStatus,
+        recording.ImuStatus,
         recording.EventRecord,
     ),
     Path("docs/reference/recording.md"): (
@@ -49,9 +48,12 @@ PAGES: dict[Path, tuple[type, ...]] = {
         model.InstrumentNoise,
         model.PrismPosition,
         model.ReferencePoint,
+        model.ImuParameters,
+        model.ImuNoise,
         model.SetupCovariance,
         model.PipelineParameters,
         model.MotionPrior,
+        model.ImuSamples,
         journal.JournalRecord,
         journal.InstrumentRecord,
         journal.TargetRecord,
@@ -99,7 +101,7 @@ def json_schema() -> dict[str, Any]:
             if name not in descriptions:
                 raise ValueError(f"{cls.__name__}.{name} has no docstring")
             if name in sometimes:
-                field.update(next(each for each in field.pop("anyOf") if each["type"] != "null"))
+                field.update(next(each for each in field.pop("anyOf") if each != {"type": "null"}))
             field.pop("title", None)
             field.pop("default", None)
             field["description"] = descriptions[name]
@@ -112,14 +114,10 @@ def json_schema() -> dict[str, Any]:
     }
 
 
-def _sometimes_written(cls: type) -> set[str]:
+def _sometimes_written(cls: type) -> frozenset[str]:
     """Return the fields that are not written when they are None."""
-    return {
-        name
-        for name, hint in typing.get_type_hints(cls, include_extras=True).items()
-        for info in getattr(hint, "__metadata__", ())
-        if isinstance(info, FieldInfo) and info.exclude_if is not None
-    }
+    omitted: frozenset[str] = getattr(cls, "omitted_if_none", frozenset())
+    return omitted
 
 
 def field_tables(classes: tuple[type, ...]) -> str:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from tsgt.master.link_events import LinkStatus, SuperframeState
     from tsgt.model import Measurement
+    from tsgt.recording import ImuStatus
     from tsgt.timesync.two_way import ClockEstimate
 
 RATE_WINDOW_NS = 10_000_000_000
@@ -75,7 +76,7 @@ class Statistics:
         self._poses += 1
         self._valid_poses += valid
 
-    def status(self, now_ns: int, link: LinkStatus = NO_LINK) -> StatusRecord:
+    def status(self, now_ns: int, link: LinkStatus = NO_LINK, imu: ImuStatus | None = None) -> StatusRecord:
         """Return the status at an instant on the master's Unix clock."""
         stations = (
             station.status_at(number, now_ns, link.clock(number, now_ns))
@@ -89,6 +90,7 @@ class Statistics:
             protocol=link.protocol,
             authenticated=link.authenticated,
             frame_ms=link.frame_ms,
+            imu=imu,
         )
 
 

@@ -18,7 +18,7 @@ from tsgt.recording.format import (
     encode_line,
 )
 from tsgt.recording.merged import MergedRecord
-from tsgt.recording.reader import Recording, load_recording, read_lines
+from tsgt.recording.reader import Recording, load_recording, read_imu_samples, read_lines
 from tsgt.recording.stream_records import (
     PROTOCOL_VERSION,
     BeaconRecord,
@@ -26,6 +26,7 @@ from tsgt.recording.stream_records import (
     Degradation,
     EventRecord,
     HelloRecord,
+    ImuStatus,
     Kind,
     PoseRecord,
     StationShare,
@@ -44,6 +45,7 @@ __all__ = [
     "Degradation",
     "EventRecord",
     "HelloRecord",
+    "ImuStatus",
     "Kind",
     "Line",
     "MergedRecord",
@@ -61,6 +63,7 @@ __all__ = [
     "encode_line",
     "load_recording",
     "new_recording_path",
+    "read_imu_samples",
     "read_lines",
     "sync_folder",
     "write_atomically",

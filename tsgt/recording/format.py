@@ -88,9 +88,15 @@ _validator: Callable[[object], SchemaValidator] = functools.cache(_validator_of)
 
 
 def encode_line(record: object) -> bytes:
-    """Turn a record into one JSON object, without a line end."""
+    """Turn a record into one JSON object, without a line end.
+
+    A class may name fields in ``omitted_if_none``: without a value their keys are absent.
+    """
     # Not dump_json: passing its dozen options takes as long as encoding a line.
-    return _adapter(type(record)).serializer.to_json(record)
+    serializer = _adapter(type(record)).serializer
+    if absent := {name for name in getattr(record, "omitted_if_none", ()) if getattr(record, name) is None}:
+        return serializer.to_json(record, exclude=absent)
+    return serializer.to_json(record)
 
 
 def decode(cls: type[T], data: bytes) -> T:

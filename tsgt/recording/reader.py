@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
+from tsgt.model import ImuSamples, Measurement, Parameters, PointMeasurement, PolarMeasurement
 from tsgt.recording.format import (
     MAX_LINE_BYTES,
     NO_HEADER,
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+
+_IMU_START = b'{"type":"imu",'  # start of every line of the IMU as it is written
 
 _MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, "point": PointMeasurement}
 
@@ -47,10 +49,13 @@ class _Stamped:
 def read_lines(
     path: Path,
     *,
+    imu: bool = False,
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Iterator[Line]:
     """Yield the lines of a recording, headers included; each is checked to be JSON with a type.
+
+    ``imu``: also yield the lines of the IMU, which are most of the bytes of a recording; skipping them costs little.
 
     ``keep_going``: skip lines that cannot be read instead of raising. ``on_problem``: called for each skipped line: a
     torn last line always, others with ``keep_going``.
@@ -66,6 +71,8 @@ def read_lines(
     """
     number = 0
     for number, raw in enumerate(_raw_lines(path), start=1):
+        if not imu and number > 1 and raw.startswith(_IMU_START) and raw.endswith(b"\n"):
+            continue
         data = raw.removesuffix(b"\n")
         try:
             kind = decode(Typed, data).type
@@ -129,6 +136,27 @@ def load_recording(
     if header is None or parameters is None:  # read_lines has checked the header
         raise RecordingError("contains no parameters; the program that wrote it ended too early", path=path)
     return Recording(header=header, parameters=parameters, measurements=measurements, end_ns=end_ns)
+
+
+def read_imu_samples(
+    path: Path,
+    *,
+    keep_going: bool = False,
+    on_problem: Callable[[RecordingError], None] | None = None,
+) -> Iterator[ImuSamples]:
+    """Yield the samples of the robot's IMU in the order of arrival; parameters and errors as of :func:`read_lines`."""
+    for line in read_lines(path, imu=True, keep_going=keep_going, on_problem=on_problem):
+        if line.type != "imu":
+            continue
+        try:
+            samples = decode_line(ImuSamples, line, path)
+        except CorruptLineError as problem:
+            if not keep_going:
+                raise
+            if on_problem is not None:
+                on_problem(problem)
+        else:
+            yield samples
 
 
 def _unreadable(raw: bytes, why: str, path: Path, line: int) -> RecordingError:

@@ -7,7 +7,7 @@ docstrings (``make generated``).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -42,8 +42,6 @@ LINEAR_PROMISE = (
 )
 
 # Aliases, because pydantic evaluates annotations at run time.
-OptionalDelay = Annotated[float | None, Field(exclude_if=lambda delay_s: delay_s is None)]
-"""Written only where there is one: the lines of all other poses are those of older versions."""
 PositionOrNone = Vector3 | None
 QuaternionOrNone = Row4 | None
 CovarianceOrNone = Annotated[tuple[float, ...], Field(min_length=36, max_length=36)] | None
@@ -131,6 +129,8 @@ class StationShare(FiniteNumbers):
 class PoseRecord(FiniteNumbers):
     """The pose of the robot at one epoch, or why there is none."""
 
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"delay_s"})
+
     type: Literal["pose"] = "pose"
     stamp_ns: int
     """Time of the pose on the master's Unix clock in ns."""
@@ -158,7 +158,7 @@ class PoseRecord(FiniteNumbers):
     kind: Kind
     """``interpolated`` between measurements (estimator ``linear``), ``predicted`` from earlier measurements, at once,
     or ``smoothed`` by measurements on both sides: at a delay, see ``delay_s``, or a lag later and final."""
-    delay_s: OptionalDelay = None
+    delay_s: float | None = None
     """Of a smoothed pose at one of the configured ``smoothed_delays_s``: that delay, in s, after which it was computed
     from the measurements that had arrived. The key is missing in all other poses. Without a measurement from after its
     epoch it has no numbers, because it would be a prediction."""
@@ -239,8 +239,38 @@ class StationStatus(FiniteNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ImuStatus(FiniteNumbers):
+    """The status of the robot's IMU."""
+
+    device: str
+    """Maker, model and serial number, as its program reports them; empty before it has."""
+    samples: int
+    """Samples since the master started."""
+    rate_hz: float | None
+    """Samples per second over the last ten seconds; null without any."""
+    age_s: float | None
+    """Age of the newest sample in s; null before the first one."""
+    gaps: int
+    """How often samples were missing since the master started."""
+    lost: int
+    """How many samples were missing."""
+    saturated: int
+    """Samples with a value at the limit of the device."""
+    clock_skew_ppm: float | None
+    """Skew of this computer's clock against the device's, in 1e-6, positive when this one is fast; null before the first
+    fit. Against a counter it also contains the error of the nominal rate."""
+    problem: str
+    """What is wrong with the device, its program or its values, for people; empty when nothing is."""
+
+
+ImuStatusOrNone = ImuStatus | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StatusRecord(FiniteNumbers):
     """The status of the master and its stations, about once per second."""
+
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu"})
 
     type: Literal["status"] = "status"
     stamp_ns: int
@@ -257,6 +287,8 @@ class StatusRecord(FiniteNumbers):
     """Whether the radio is authenticated with a key; ``classic`` has none. Null without a radio."""
     frame_ms: float | None = None
     """Mean duration of the last frames, from beacon to beacon, in ms; null with ``classic``."""
+    imu: ImuStatusOrNone = None
+    """Status of the robot's IMU; absent where none is configured."""
 
     def __post_init__(self) -> None:
         """Reject times outside 64 bits."""

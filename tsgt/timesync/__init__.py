@@ -6,6 +6,7 @@ sigma and bound. The station uses `beacon_clock` (the master's session time) and
 """
 
 from tsgt.timesync.beacon_clock import MAX_SAMPLES, BeaconClock
+from tsgt.timesync.envelope import fit_lower_envelope
 from tsgt.timesync.instrument_clock import MAX_DELAY_NS, InstrumentClock
 from tsgt.timesync.link_delay import LinkDelayEstimator
 from tsgt.timesync.periodicity import Period, Periodicity
@@ -18,4 +19,5 @@ __all__ = [
     "LinkDelayEstimator",
     "Period",
     "Periodicity",
+    "fit_lower_envelope",
 ]

@@ -11,17 +11,27 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from harness import imu
+from harness.bridge import FakeStart
 from harness.field import STATIONS, TRUE, field_of, running
 from harness.radios import PAPER
 from harness.scene import START, driving, stationary_scene
 
-from tsgt.config import GeofenceConfig
+from tsgt.config import GeofenceConfig, ImuConfig
 from tsgt.errors import RadioError
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.geofence import run_geofence_command
 from tsgt.master.replay import replayed
-from tsgt.model import PolarMeasurement, Status
-from tsgt.recording import ClockRecord, EventRecord, PoseRecord, StatusRecord, encode_line, read_lines
+from tsgt.model import ImuSamples, PolarMeasurement, Status
+from tsgt.recording import (
+    ClockRecord,
+    EventRecord,
+    PoseRecord,
+    StatusRecord,
+    encode_line,
+    read_imu_samples,
+    read_lines,
+)
 from tsgt.service import run
 from tsgt.simulation.lora import radio_opener
 
@@ -199,6 +209,63 @@ async def test_recording_equals_stream_and_replay(tmp_path: Path, protocol: dict
     assert [line.data for line in lines[2:]] == streamed
     assert [line for _, some in replayed(field.recording()) for line in some] == streamed
     assert {"geofence_exited", "geofence_entered", "station_lost 3"} <= set(events(field))
+
+
+class ImuProgram:
+    """Starts a program that prints samples on a task of its own, until it is told to end."""
+
+    def __init__(self) -> None:
+        self.start = FakeStart(TRUE, imu.HELLO)
+        self.silent = False
+
+    async def run(self) -> None:
+        """Print ten samples every 50 ms."""
+        for number in range(0, 10**6, 10):
+            await asyncio.sleep(0.05)
+            if self.start.programs and not self.silent:
+                self.start.programs[-1].print_lines(imu.samples(number, 10))
+
+
+IMU = ImuConfig(
+    command=("imu",), position_m=(0, 0, 0), orientation_xyzw=(0.0, 0.0, 0.0, 1.0), gravity_mps2=9.81
+)
+
+
+async def test_samples_of_the_imu_are_recorded_and_not_streamed(tmp_path: Path) -> None:
+    """Status and events show it; its loss leaves the poses alone, and a replay skips the samples."""
+    program = ImuProgram()
+    async with (
+        field_of(tmp_path) as field,
+        running(program.run()),
+        running(field.master(field.config(imu=IMU), start_imu=program.start)),
+    ):
+        await asyncio.sleep(15)
+        program.silent = True
+        await asyncio.sleep(5)
+        program.silent = False
+        await asyncio.sleep(5)
+    assert events(field) == ["imu_lost", "imu_recovered"]
+    status = next(s for s in field.of(StatusRecord) if s.stamp_ns > START + 12_000 * MS)
+    assert status.imu is not None
+    assert status.imu.rate_hz == pytest.approx(200, abs=12)
+    assert status.imu.problem == ""
+    samples = list(read_imu_samples(field.recording()))
+    assert samples == field.of(ImuSamples)
+    assert sum(len(record.stamp_ns) for record in samples) > 3500
+    others = [encode_line(record) for record in field.records if not isinstance(record, ImuSamples)]
+    assert [line.data for line in read_lines(field.recording())][2:] == others
+    assert [line for _, some in replayed(field.recording()) for line in some] == others
+    assert field.of(PoseRecord)[-1].valid
+
+
+async def test_useless_program_of_the_imu_harms_nothing(tmp_path: Path) -> None:
+    """It prints garbage, floods and dies, again and again."""
+    start = FakeStart(TRUE, b"garbage\n" * 100, imu.HELLO, imu.samples(0, 10), b"x\n" * 6000)
+    async with field_of(tmp_path) as field, running(field.master(field.config(imu=IMU), start_imu=start)):
+        await asyncio.sleep(12)
+    assert len(start.programs) > 5
+    assert field.of(PoseRecord)[-1].valid
+    assert events(field) == ["imu_lost"]
 
 
 @pytest.mark.parametrize("at_ms", [0, 1, 30, 200, 1000, 1777, 4000, 4100, 5321, 9000])

@@ -2,22 +2,51 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
-from harness.records import CLOCK, EVENT, HEADER, HELLO, NO_POSE, PARAMETERS, POINT, POSE, STATUS, measurement
+from harness.records import (
+    CLOCK,
+    EVENT,
+    HEADER,
+    HELLO,
+    IMU_PARAMETERS,
+    IMU_STATUS,
+    NO_POSE,
+    PARAMETERS,
+    POINT,
+    POSE,
+    STATUS,
+    imu_samples,
+    measurement,
+)
 
-from tsgt.model import PointMeasurement, PolarMeasurement
-from tsgt.recording import decode, encode_line
+from tsgt.model import Parameters, PointMeasurement, PolarMeasurement
+from tsgt.recording import StatusRecord, decode, encode_line
 
 
 @pytest.mark.parametrize(
     "record",
-    [HEADER, PARAMETERS, HELLO, measurement(3), POINT, POSE, NO_POSE, STATUS, EVENT],
+    [HEADER, PARAMETERS, HELLO, measurement(3), POINT, POSE, NO_POSE, STATUS, EVENT, imu_samples(0)],
     ids=lambda r: r.type,
 )
 def test_records_round_trip(record: object) -> None:
     """Records round trip."""
     assert decode(type(record), encode_line(record)) == record
+
+
+@pytest.mark.parametrize("record", [PARAMETERS, STATUS], ids=lambda r: r.type)
+def test_key_of_an_imu_is_absent_without_one(record: object) -> None:
+    """Recordings without an IMU have no trace of it."""
+    assert b"imu" not in encode_line(record)
+
+
+def test_parameters_and_status_with_an_imu_round_trip() -> None:
+    """The key is present then."""
+    status = replace(STATUS, imu=IMU_STATUS)
+    assert decode(StatusRecord, encode_line(status)) == status
+    parameters = replace(PARAMETERS, imu=IMU_PARAMETERS)
+    assert decode(Parameters, encode_line(parameters)) == parameters
 
 
 def test_encoded_record_has_no_line_end() -> None:

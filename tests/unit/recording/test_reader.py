@@ -14,12 +14,20 @@ from harness.records import (
     SECOND,
     START,
     STATUS,
+    imu_samples,
     measurement,
     recording_bytes,
 )
 
 from tsgt.errors import CorruptLineError, RecordingError, RecordingVersionError
-from tsgt.recording import MAX_LINE_BYTES, MergedRecord, encode_line, load_recording, read_lines
+from tsgt.recording import (
+    MAX_LINE_BYTES,
+    MergedRecord,
+    encode_line,
+    load_recording,
+    read_imu_samples,
+    read_lines,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,6 +101,34 @@ def test_line_keeps_number_and_bytes(path: Path) -> None:
     """A line comes as it stands in the file, with its number."""
     path.write_bytes(recording_bytes(POSE))
     assert list(read_lines(path))[2] == (3, "pose", encode_line(POSE))
+
+
+def test_lines_of_the_imu_are_for_those_who_ask(path: Path) -> None:
+    """Other readers skip them, and lines keep their numbers."""
+    path.write_bytes(recording_bytes(imu_samples(0), measurement(0), imu_samples(10)))
+    assert [(line.number, line.type) for line in read_lines(path)][2:] == [(4, "measurement")]
+    assert [line.type for line in read_lines(path, imu=True)][2:] == ["imu", "measurement", "imu"]
+    assert list(read_imu_samples(path)) == [imu_samples(0), imu_samples(10)]
+
+
+def test_torn_line_of_the_imu_is_reported(path: Path) -> None:
+    """Like any other torn last line."""
+    path.write_bytes(recording_bytes(imu_samples(0)) + encode_line(imu_samples(10))[:100])
+    problems: list[RecordingError] = []
+    list(read_lines(path, on_problem=problems.append))
+    assert "torn" in str(problems)
+
+
+def test_corrupt_line_of_the_imu_is_skipped_when_asked(path: Path) -> None:
+    """A field is missing."""
+    path.write_bytes(
+        recording_bytes() + b'{"type":"imu","sequence":1}\n' + encode_line(imu_samples(10)) + b"\n"
+    )
+    with pytest.raises(CorruptLineError, match="line 3: cannot be used as imu"):
+        list(read_imu_samples(path))
+    problems: list[RecordingError] = []
+    assert list(read_imu_samples(path, keep_going=True, on_problem=problems.append)) == [imu_samples(10)]
+    assert len(problems) == 1
 
 
 def test_torn_last_line_is_reported_and_skipped(path: Path) -> None:

@@ -119,7 +119,7 @@ def merge(
         recorded = index_recording(recording, keep_going=keep_going, on_problem=on_problem)
         merged, additions = _additions(recorded, recording, paths, loaded)
         with write_atomically(output) as file:
-            for line in read_lines(recording, keep_going=keep_going):
+            for line in read_lines(recording, imu=True, keep_going=keep_going):
                 file.write(line.data + b"\n")
             for addition in additions:
                 file.write(encode_line(addition.record) + b"\n")

@@ -1,0 +1,94 @@
+"""The device's clock on the host's, from samples that are late at random."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tsgt.imu.device_clock import DeviceClock
+
+MS = 1_000_000
+PERIOD_NS = 5 * MS
+START_NS = 10**12
+FASTEST_NS = 300_000
+
+
+def stamps(
+    clock: DeviceClock, true_ns: list[float], device_ns: list[int], delays_ns: np.ndarray
+) -> list[tuple[float, float]]:
+    """Return instant and error of each stamp against the fastest possible arrival, in ns."""
+    errors = []
+    for true, device, delay in zip(true_ns, device_ns, delays_ns, strict=True):
+        clock.add(device, int(true + FASTEST_NS + delay))
+        if clock.initialised:
+            errors.append((true, clock.stamp(device) - true - FASTEST_NS))
+    return errors
+
+
+def regular(count: int, skew: float, *, seed: int = 0) -> tuple[list[float], list[int], np.ndarray]:
+    """Return instants, device times, and random delays with a mean of 1 ms."""
+    true_ns = [START_NS + i * PERIOD_NS * (1 + skew) for i in range(count)]
+    device_ns = [777 + i * PERIOD_NS for i in range(count)]
+    return true_ns, device_ns, np.random.default_rng(seed).exponential(MS, count)
+
+
+@pytest.mark.parametrize(("counter", "skew"), [(False, 30e-6), (False, -150e-6), (True, 0.012)])
+def test_stamps_are_exact_despite_jitter(skew: float, *, counter: bool) -> None:
+    """Delays of 1 ms leave some microseconds, also with a counter whose rate is off by a percent."""
+    clock = DeviceClock(counter=counter)
+    errors = [error for _, error in stamps(clock, *regular(4000, skew))]
+    assert max(map(abs, errors[:200])) < 500_000
+    assert max(map(abs, errors[2000:])) < 20_000
+    assert clock.skew_ppm == pytest.approx(1e6 * skew, abs=2.0)
+
+
+def test_corrections_do_not_tear_samples_apart() -> None:
+    """Stamps of samples that follow each other differ by their duration to 0.2 percent."""
+    clock = DeviceClock()
+    found = stamps(clock, *regular(3000, 20e-6))
+    steps = [(b_true - a_true, b - a) for (a_true, a), (b_true, b) in pairwise(found)]
+    assert max(abs(error) for _, error in steps) < 0.002 * PERIOD_NS
+
+
+def test_late_burst_is_harmless() -> None:
+    """A stall of 3 s, whose samples arrive at once, changes nothing."""
+    true_ns, device_ns, delays_ns = regular(4000, 20e-6)
+    stalled = slice(2000, 2600)
+    end_ns = true_ns[2600]
+    delays_ns[stalled] = [end_ns - true for true in true_ns[stalled]]
+    clock = DeviceClock()
+    errors = [error for true, error in stamps(clock, true_ns, device_ns, delays_ns) if true > true_ns[1000]]
+    assert max(map(abs, errors)) < 20_000
+    assert clock.steps == 0
+
+
+def test_stale_samples_in_a_buffer_are_harmless() -> None:
+    """The first second of samples arrives at once when the port is opened."""
+    true_ns, device_ns, delays_ns = regular(2000, 0.0)
+    delays_ns[:200] = [true_ns[200] - true for true in true_ns[:200]]
+    found = stamps(DeviceClock(), true_ns, device_ns, delays_ns)
+    assert max(abs(error) for _, error in found) < 500_000
+
+
+def test_device_clock_set_ahead_is_fitted_anew() -> None:
+    """Samples that arrive before they were made mean a step, and stamps are exact again after 0.5 s."""
+    true_ns, device_ns, delays_ns = regular(2000, 0.0)
+    device_ns[1000:] = [time + 50 * MS for time in device_ns[1000:]]
+    clock = DeviceClock()
+    found = stamps(clock, true_ns, device_ns, delays_ns)
+    assert clock.steps == 1
+    after = [error for true, error in found if true > true_ns[1102]]
+    assert len(after) > 800
+    assert max(map(abs, after)) < 500_000
+
+
+def test_one_early_sample_is_not_used() -> None:
+    """A corrupted time changes nothing."""
+    true_ns, device_ns, delays_ns = regular(1000, 0.0)
+    clock = DeviceClock()
+    stamps(clock, true_ns[:500], device_ns[:500], delays_ns[:500])
+    assert not clock.add(device_ns[500] + 10**10, int(true_ns[500]))
+    found = stamps(clock, true_ns[501:], device_ns[501:], delays_ns[501:])
+    assert max(abs(error) for _, error in found) < 300_000

@@ -1,0 +1,66 @@
+"""Durations and gaps by the device's counter and clock."""
+
+from __future__ import annotations
+
+import pytest
+
+from tsgt.imu.sample_times import SampleTime, SampleTimes
+
+MS = 1_000_000
+
+
+def pushed(*samples: tuple[int | None, int | None], rate_hz: float = 200.0) -> list[SampleTime | None]:
+    """Return what follows the first sample."""
+    times = SampleTimes(rate_hz)
+    return [times.push(*sample) for sample in samples][1:]
+
+
+def test_clock_gives_durations() -> None:
+    """Also where they differ from the nominal period."""
+    found = pushed((None, 0), (None, 5_100_000), (None, 10_000_000))
+    assert found == [SampleTime(5_100_000, 5_100_000, 0, False), SampleTime(10_000_000, 4_900_000, 0, False)]
+
+
+def test_counter_gives_durations_in_nominal_periods() -> None:
+    """The device clock corrects the period."""
+    assert pushed((7, None), (8, None)) == [SampleTime(40 * MS, 5 * MS, 0, False)]
+
+
+@pytest.mark.parametrize(
+    "samples", [((1, None), (4, None)), ((None, 5 * MS), (None, 20 * MS)), ((1, 5 * MS), (4, 20 * MS))]
+)
+def test_lost_samples_are_counted(samples: tuple[tuple[int | None, int | None], ...]) -> None:
+    """The sample after a gap lasts no longer than any other."""
+    assert pushed(*samples) == [SampleTime(20 * MS, 5 * MS, 2, False)]
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        ((None, 5 * MS), (None, 4 * MS)),
+        ((9, None), (3, None)),
+        ((9, 100 * MS), (10, 5 * MS)),
+        ((9, 100 * MS), (10, 150 * MS)),
+        ((9, None), (None, 100 * MS)),
+        ((9, None), (10**12, None)),
+    ],
+    ids=[
+        "clock back",
+        "counter back",
+        "clock set back",
+        "clock set ahead",
+        "other source",
+        "counter far ahead",
+    ],
+)
+def test_steps_are_restarts(samples: tuple[tuple[int | None, int | None], ...]) -> None:
+    """Earlier times have another origin then."""
+    (found,) = pushed(*samples)
+    assert found is not None
+    assert found.restarted
+    assert found.duration_ns == 5 * MS
+
+
+def test_repeated_sample_is_none() -> None:
+    """The same counter and time."""
+    assert pushed((1, 5 * MS), (1, 5 * MS)) == [None]

@@ -1,0 +1,166 @@
+"""The JSON lines of the program that reads the IMU, as docs/reference/imu-program.md specifies them. Sans-I/O.
+
+Lines of unknown type and unknown keys are ignored, so that the format can grow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from tsgt.model import MAX_INSTANT_NS, Vector3
+from tsgt.recording import Typed, decode
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+FORMAT_VERSION = 1  # changes when a master of the old version would misunderstand the new one
+
+MAX_LINE_BYTES = 65_536  # longer lines are truncated; ten samples take 1.5 kB
+
+MAX_SAMPLES_PER_LINE = 256
+
+MAX_ANGULAR_RATE_RADPS = 100.0  # no IMU measures 6000 deg/s: a larger number has another unit
+
+MAX_SPECIFIC_FORCE_MPS2 = 2_000.0  # 200 g
+
+_MIN_RATE_HZ, _MAX_RATE_HZ = 1.0, 5_000.0
+
+Count = Annotated[int, Field(ge=0, le=MAX_INSTANT_NS)]
+Counts = Annotated[tuple[Count, ...], Field(max_length=MAX_SAMPLES_PER_LINE)] | None
+Vectors = Annotated[tuple[Vector3, ...], Field(max_length=MAX_SAMPLES_PER_LINE)] | None
+Limit = Annotated[float, Field(gt=0, le=1e6)] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HelloLine:
+    """The program's first line: version of the format, identity of the device, rate of its samples.
+
+    Attributes
+    ----------
+    rate_hz
+        Nominal rate of the samples.
+    clock
+        Name of the device's clock or counter, for people.
+    angular_rate_limit_radps, specific_force_limit_mps2
+        Full scale of each axis; null where unknown.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["hello"] = "hello"
+    imu: int
+    make: str
+    model: str = ""
+    serial_number: str = ""
+    firmware: str = ""
+    rate_hz: Annotated[float, Field(ge=_MIN_RATE_HZ, le=_MAX_RATE_HZ)]
+    clock: str = ""
+    angular_rate_limit_radps: Limit = None
+    specific_force_limit_mps2: Limit = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SamplesLine:
+    """Consecutive samples: lists with one entry per sample."""
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["samples"] = "samples"
+    counter: Counts = None
+    instrument_time_ns: Counts = None
+    host_time_ns: Counts = None
+    angular_rate_radps: Vectors = None
+    delta_angle_rad: Vectors = None
+    specific_force_mps2: Vectors = None
+    delta_velocity_mps: Vectors = None
+
+    def __post_init__(self) -> None:
+        """Reject lines that leave time or motion open, and values that have another unit."""
+        if self.counter is None and self.instrument_time_ns is None:
+            raise ValueError("neither counter nor instrument_time_ns, without which samples have no time")
+        if (self.angular_rate_radps is None) == (self.delta_angle_rad is None):
+            raise ValueError("expected either angular_rate_radps or delta_angle_rad")
+        if (self.specific_force_mps2 is None) == (self.delta_velocity_mps is None):
+            raise ValueError("expected either specific_force_mps2 or delta_velocity_mps")
+        given: list[Sequence[object]] = [
+            each
+            for each in (
+                self.counter,
+                self.instrument_time_ns,
+                self.host_time_ns,
+                self.angular_rate_radps,
+                self.delta_angle_rad,
+                self.specific_force_mps2,
+                self.delta_velocity_mps,
+            )
+            if each is not None
+        ]
+        lengths = {len(each) for each in given}
+        if len(lengths) > 1 or 0 in lengths:
+            raise ValueError("the lists have different lengths, or none has an entry")
+        if self.angular_rate_radps is not None:
+            check_angular_rate(self.angular_rate_radps)
+        if self.specific_force_mps2 is not None:
+            check_specific_force(self.specific_force_mps2)
+
+    def __len__(self) -> int:
+        return len(self.counter or self.instrument_time_ns or ())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusLine:
+    """What the program does, and what the operator should correct."""
+
+    type: Literal["status"] = "status"
+    activity: str = ""
+    problem: str = ""
+
+
+ProgramLine = HelloLine | SamplesLine | StatusLine
+
+_KINDS: dict[str, type[ProgramLine]] = {"hello": HelloLine, "samples": SamplesLine, "status": StatusLine}
+
+
+@dataclass(frozen=True, slots=True)
+class _Versioned:
+    imu: int
+
+
+class ImuVersionError(ValueError):
+    """The program uses another version of the format: none of its lines can be used."""
+
+
+def decode_program_line(data: bytes) -> ProgramLine | None:
+    """Decode a line of a program; None for an unknown type.
+
+    Raises ImuVersionError for the ``hello`` of another version, and ValueError (one line) if it is not JSON or a field
+    is missing or invalid.
+    """
+    kind = decode(Typed, data).type
+    if kind == "hello" and (version := decode(_Versioned, data).imu) != FORMAT_VERSION:
+        raise ImuVersionError(
+            f"uses version {version} of the lines of an IMU, and this master version {FORMAT_VERSION}"
+        )
+    return decode(_KINDS[kind], data) if kind in _KINDS else None
+
+
+def check_angular_rate(rates_radps: Sequence[Vector3]) -> None:
+    """Reject angular rates that no device measures; the message names the unit."""
+    largest = max(map(abs, chain.from_iterable(rates_radps)))
+    if largest > MAX_ANGULAR_RATE_RADPS:
+        raise ValueError(
+            f"an angular rate of {largest:g}; expected rad/s, at most {MAX_ANGULAR_RATE_RADPS:g}"
+        )
+
+
+def check_specific_force(forces_mps2: Sequence[Vector3]) -> None:
+    """Reject specific forces that no device measures; the message names the unit."""
+    largest = max(map(abs, chain.from_iterable(forces_mps2)))
+    if largest > MAX_SPECIFIC_FORCE_MPS2:
+        raise ValueError(
+            f"a specific force of {largest:g}; expected m/s^2, at most {MAX_SPECIFIC_FORCE_MPS2:g}"
+        )

@@ -1,0 +1,83 @@
+"""When each sample ends and how long it lasts, on the device's own clock, with what was lost between. Sans-I/O.
+
+Durations never come from arrivals: the rotation over a sample is its rate times its duration, and delays of 1 ms in the
+durations would triple the error of the position.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+_REMEMBERED = 512  # samples that are recognised when they are printed again
+
+_MAX_STEPS = 1e7  # a count that is further ahead is not a gap of samples
+
+
+class SampleTime(NamedTuple):
+    """One sample on the device's clock.
+
+    Attributes
+    ----------
+    end_ns
+        End of its interval; only differences are meaningful, and only while ``restarted`` is not set.
+    duration_ns
+        Length of the interval.
+    lost
+        Number of samples that the device made between the one before and this one.
+    restarted
+        Whether clock or counter have been set, or have begun again: earlier times have another origin.
+    """
+
+    end_ns: int
+    duration_ns: int
+    lost: int
+    restarted: bool
+
+
+class SampleTimes:
+    """Follows counter and clock of one device; ``rate_hz`` is its nominal rate."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = 1e9 / rate_hz
+        self._last: tuple[int | None, int | None] | None = None
+        self._recent: deque[tuple[int | None, int | None]] = deque(maxlen=_REMEMBERED)
+
+    def push(self, counter: int | None, instrument_time_ns: int | None) -> SampleTime | None:
+        """Take the next sample, with at least one of both; None for a recent sample once more."""
+        sample = (counter, instrument_time_ns)
+        last = self._last
+        if last is not None and _not_after(sample, last) and sample in self._recent:
+            return None
+        self._last = sample
+        self._recent.append(sample)
+        period_ns = round(self._period_ns)
+        end_ns = round((counter or 0) * self._period_ns) if instrument_time_ns is None else instrument_time_ns
+        restart = SampleTime(end_ns, period_ns, 0, restarted=True)
+        if last is None:
+            return restart
+        before, time_before_ns = last
+        if (before is None) != (counter is None) or (time_before_ns is None) != (instrument_time_ns is None):
+            return restart
+        steps = None if counter is None or before is None else counter - before
+        if instrument_time_ns is None or time_before_ns is None:
+            assert steps is not None  # noqa: S101 (one of both is given)
+            duration_ns = period_ns
+        else:
+            span_ns = instrument_time_ns - time_before_ns
+            if span_ns <= 0:
+                return restart
+            if steps is None:
+                steps = max(1, round(span_ns / self._period_ns))
+            elif steps > 0 and not 0.5 < span_ns / (steps * self._period_ns) < 1.5:  # the clock was set
+                return restart
+            duration_ns = round(span_ns / steps) if steps > 0 else period_ns
+        if not 0 < steps <= _MAX_STEPS:
+            return restart
+        return SampleTime(end_ns, duration_ns, steps - 1, restarted=False)
+
+
+def _not_after(sample: tuple[int | None, int | None], last: tuple[int | None, int | None]) -> bool:
+    return any(
+        new is not None and old is not None and new <= old for new, old in zip(sample, last, strict=True)
+    )

@@ -1,16 +1,50 @@
 """Inertial measurements in the trajectory: samples, preintegration, states, factors and strapdown integration. Sans-I/O.
 
 In: samples of an IMU as arrays, its calibration, polar measurements of the prisms. Out: states of the IMU with covariances.
+docs/explanation/imu.md derives the equations.
 """
 
+from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
+from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
+from tsgt.geometry.inertial.solver import (
+    MAX_KNOT_SPACING_S,
+    InertialSetup,
+    InertialSolution,
+    anchor_at_end,
+    inertial_knot_times,
+    solve_inertial,
+)
+from tsgt.geometry.inertial.states import (
+    INERTIAL_STATE_DIM,
+    Gravity,
+    InertialStates,
+    Mounting,
+    concatenate_inertial_states,
+)
 
 __all__ = [
+    "INERTIAL_STATE_DIM",
+    "MAX_KNOT_SPACING_S",
     "ContiguousSamples",
+    "Gravity",
+    "HeadingSearch",
+    "InertialAnchor",
+    "InertialFactors",
     "InertialSamples",
+    "InertialSetup",
+    "InertialSolution",
+    "InertialStates",
+    "Mounting",
     "Preintegrated",
+    "anchor_at_end",
+    "concatenate_inertial_states",
     "concatenate_samples",
     "contiguous",
+    "inertial_knot_times",
     "preintegrate",
+    "search_heading",
+    "solve_inertial",
+    "states_on_tracks",
 ]

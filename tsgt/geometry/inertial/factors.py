@@ -1,0 +1,337 @@
+"""Factors of a trajectory with an IMU, and their normal equations. Sans-I/O.
+
+Between neighbouring knots: the preintegrated motion and the random walks of the biases. Without an accelerometer the
+preintegrated rotation alone, and the motion prior for position, velocity and acceleration. At knots: measurements of the
+prisms, the same as without an IMU. docs/explanation/imu.md derives the Jacobians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tsgt.geometry.inertial.preintegration import Preintegrated, preintegrate
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, Gravity, InertialStates
+from tsgt.geometry.rigid import (
+    IDENTITY,
+    FloatArray,
+    dot,
+    exp_so3,
+    fast_log_so3,
+    inverse_right_jacobian,
+    matvec,
+    skew,
+)
+from tsgt.geometry.trajectory.gauss_newton import add_measurements, robust_loss
+from tsgt.geometry.trajectory.measurement_factors import linearise
+from tsgt.geometry.trajectory.motion_prior import process_information, transition
+from tsgt.geometry.trajectory.states import States
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.inertial.preintegration import ContiguousSamples
+    from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
+    from tsgt.model import ImuNoise, MotionPrior
+
+_EARLIER, _LATER = slice(0, 15), slice(15, 30)
+_TILT, _RESIDUAL = slice(30, 32), 32
+_COLUMNS = 33
+_FACTORS_PER_CHUNK = 256  # Stay in the cache
+
+
+@dataclass(frozen=True, slots=True)
+class InertialFactors:
+    """Factors of the K - 1 steps between knots; they depend on the samples, not on the states."""
+
+    preintegrated: Preintegrated
+    whitening: FloatArray  # (K - 1, 9, 9) inverse Cholesky factor of the covariance; (K - 1, 3, 3) of the rotation alone
+    walk_information: FloatArray  # (K - 1, 2) of each bias: inverse variance of its change
+    # Without an accelerometer: transition, (K - 1, 3, 3), and information by axis, (K - 1, 3, 3, 3), of the motion prior
+    motion: tuple[FloatArray, FloatArray] | None = None
+
+    def __len__(self) -> int:
+        return len(self.preintegrated)
+
+    @property
+    def with_accelerometer(self) -> bool:
+        """Whether the specific force is used."""
+        return self.motion is None
+
+    @classmethod
+    def of(
+        cls,
+        samples: ContiguousSamples,
+        states: InertialStates,
+        noise: ImuNoise,
+        *,
+        gyro_only: MotionPrior | None = None,
+    ) -> InertialFactors:
+        """Preintegrate between the states' times, about their biases; ``gyro_only``: prior of the motion in place of forces."""
+        bias = np.zeros(3) if gyro_only else states.bias_or_acceleration[:-1]
+        found = preintegrate(samples, states.time_s[:-1], states.time_s[1:], states.gyro_bias[:-1], bias)
+        walks = np.array([noise.gyro_bias_walk, noise.accelerometer_bias_walk])
+        walk_information = 1.0 / (walks**2 * found.duration_s[:, None])
+        if gyro_only is None:
+            return cls(found, np.linalg.inv(np.linalg.cholesky(found.covariance)), walk_information)
+        sigma = 1.0 / np.sqrt(found.covariance[:, 3, 3])
+        time_s = gyro_only.acceleration_correlation_time_s
+        weights = np.array(gyro_only.acceleration_sigma_mps2) ** -2.0
+        information = process_information(found.duration_s, time_s)
+        return cls(
+            found,
+            sigma[:, None, None] * IDENTITY,
+            walk_information,
+            (
+                transition(found.duration_s, time_s),
+                information[:, None] * weights[:, None, None],
+            ),
+        )
+
+    def select(self, rows: slice) -> InertialFactors:
+        """Return the factors of some steps."""
+        return InertialFactors(
+            self.preintegrated.select(rows),
+            self.whitening[rows],
+            self.walk_information[rows],
+            None if self.motion is None else (self.motion[0][rows], self.motion[1][rows]),
+        )
+
+
+class InertialEquations(NamedTuple):
+    """Normal equations of K states and of the tilt of gravity, which borders them."""
+
+    diagonal: FloatArray  # (K, 15, 15)
+    off_diagonal: FloatArray  # (K - 1, 15, 15)
+    gradient: FloatArray  # (K, 15)
+    border: FloatArray  # (K, 15, 2) of states and tilt
+    corner: FloatArray  # (2, 2)
+    corner_gradient: FloatArray  # (2,)
+    cost: float  # Minus twice the log posterior density, up to a constant
+    squared_distances: FloatArray  # (M,) squared Mahalanobis distance of each measurement's residual
+    weights: FloatArray  # (M,) of the robust loss
+    linearised: LinearisedMeasurements
+    whitened: FloatArray  # (M, 3, 16) Jacobians and residuals of measurements, without the robust weights
+
+
+@dataclass(frozen=True, slots=True)
+class InertialAnchor:
+    """Gaussian prior on the first knot and the tilt, which may be correlated."""
+
+    linearisation_point: InertialStates  # One knot about which the error is counted
+    tilt: FloatArray  # (2,) likewise
+    information: FloatArray  # (17, 17) inverse covariance of the errors
+    mean: FloatArray  # (17,) of the errors
+
+
+def assemble_inertial(
+    observations: Observations,
+    knot_index: NDArray[np.intp],
+    knots: InertialStates,
+    kinematics: tuple[FloatArray, FloatArray],
+    gravity: Gravity,
+    factors: InertialFactors,
+    anchor: InertialAnchor,
+    *,
+    active: NDArray[np.bool_] | None = None,
+    rejectable: NDArray[np.bool_] | None = None,
+) -> InertialEquations:
+    """Assemble the normal equations at a trajectory.
+
+    The layout of ``observations`` is from the IMU's origin in its axes. ``kinematics``: angular rate and specific force at
+    the knots, (K, 3) each, biases included. ``active`` and ``rejectable``: as without an IMU.
+    """
+    count = len(knots)
+    linearised = linearise(observations, _as_states(knots, kinematics, gravity, factors), knot_index)
+    whitened = _by_inertial_states(
+        linearised.whitened(observations), gyro_only=not factors.with_accelerometer
+    )
+    squared_distances = dot(whitened[:, :, 15], whitened[:, :, 15])
+    weights, loss = robust_loss(squared_distances, active=active, rejectable=rejectable)
+    diagonal = np.zeros((count, INERTIAL_STATE_DIM, INERTIAL_STATE_DIM))
+    off_diagonal = np.zeros((count - 1, INERTIAL_STATE_DIM, INERTIAL_STATE_DIM))
+    gradient, border = np.zeros((count, INERTIAL_STATE_DIM)), np.zeros((count, INERTIAL_STATE_DIM, TILT_DIM))
+    corner, corner_gradient = np.zeros((TILT_DIM, TILT_DIM)), np.zeros(TILT_DIM)
+    add_measurements(whitened, weights, knot_index, diagonal, gradient)
+    cost = float(loss.sum())
+    for start in range(0, count - 1, _FACTORS_PER_CHUNK):
+        chunk = slice(start, min(start + _FACTORS_PER_CHUNK, count - 1))
+        later = slice(chunk.start + 1, chunk.stop + 1)
+        rows = linearise_inertial(
+            knots.select(slice(chunk.start, later.stop)), gravity, factors.select(chunk)
+        )
+        normal = np.swapaxes(rows, 1, 2) @ rows
+        diagonal[chunk] += normal[:, _EARLIER, _EARLIER]
+        diagonal[later] += normal[:, _LATER, _LATER]
+        off_diagonal[chunk] += normal[:, _EARLIER, _LATER]
+        gradient[chunk] += normal[:, _EARLIER, _RESIDUAL]
+        gradient[later] += normal[:, _LATER, _RESIDUAL]
+        border[chunk] += normal[:, _EARLIER, _TILT]
+        border[later] += normal[:, _LATER, _TILT]
+        corner += normal[:, _TILT, _TILT].sum(axis=0)
+        corner_gradient += normal[:, _TILT, _RESIDUAL].sum(axis=0)
+        cost += float(normal[:, _RESIDUAL, _RESIDUAL].sum())
+    cost += _add_walks(knots, factors, diagonal, off_diagonal, gradient)
+
+    first = knots.select(slice(0, 1)).local_coordinates_about(anchor.linearisation_point)[0]
+    by_error = np.eye(INERTIAL_STATE_DIM + TILT_DIM)
+    by_error[3:6, 3:6] = inverse_right_jacobian(first[3:6])
+    error = np.concatenate([first, gravity.tilt - anchor.tilt]) - anchor.mean
+    weighted = by_error.T @ anchor.information
+    information, by_anchor = weighted @ by_error, weighted @ error
+    diagonal[0] += information[:15, :15]
+    gradient[0] += by_anchor[:15]
+    border[0] += information[:15, 15:]
+    corner += information[15:, 15:]
+    corner_gradient += by_anchor[15:]
+    cost += float(error @ anchor.information @ error)
+    return InertialEquations(
+        diagonal,
+        off_diagonal,
+        gradient,
+        border,
+        corner,
+        corner_gradient,
+        cost,
+        squared_distances,
+        weights,
+        linearised,
+        whitened,
+    )
+
+
+def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: InertialFactors) -> FloatArray:
+    """Whitened rows of the K - 1 factors between knots, (K - 1, R, 33), but for the walks of the biases.
+
+    Columns: the errors of the earlier state, 15, of the later one, 15, of the tilt, 2, and the residual.
+    """
+    found = factors.preintegrated
+    gyro_only = not factors.with_accelerometer
+    earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
+    bias = found.accelerometer_bias if gyro_only else earlier.bias_or_acceleration
+    position, rotation, velocity = found.corrected(earlier.gyro_bias, bias)
+    R_T = np.swapaxes(earlier.rotation, 1, 2)
+    turned = R_T @ later.rotation
+    residual = fast_log_so3(np.swapaxes(rotation, 1, 2) @ turned)
+    J_r_inv = inverse_right_jacobian(residual)
+    by_rotation = np.zeros((len(found), 3, _COLUMNS))
+    by_rotation[:, :, 3:6] = -J_r_inv @ np.swapaxes(turned, 1, 2)
+    # The correction by the bias is applied to the preintegrated rotation on its right.
+    correction = exp_so3(-residual)
+    by_rotation[:, :, 9:12] = -J_r_inv @ correction @ found.by_gyro_bias[:, 3:6]
+    by_rotation[:, :, 18:21] = J_r_inv
+    by_rotation[:, :, _RESIDUAL] = residual
+    if gyro_only:
+        whitened = factors.whitening @ by_rotation
+        return np.concatenate([whitened, _motion_rows(earlier, later, factors)], axis=1)
+    duration_s = found.duration_s[:, None]
+    fall = gravity.vector()
+    moved = matvec(
+        R_T, later.position - earlier.position - earlier.velocity * duration_s - 0.5 * duration_s**2 * fall
+    )
+    gained = matvec(R_T, later.velocity - earlier.velocity - duration_s * fall)
+    by_tilt = R_T @ gravity.by_tilt()
+    rows = np.zeros((len(found), 9, _COLUMNS))
+    rows[:, 3:6] = by_rotation
+    rows[:, 0:3, 0:3], rows[:, 0:3, 15:18] = -R_T, R_T
+    rows[:, 0:3, 3:6] = skew(moved)
+    rows[:, 0:3, 6:9] = -duration_s[..., None] * R_T
+    rows[:, 0:3, _TILT] = -0.5 * duration_s[..., None] ** 2 * by_tilt
+    rows[:, 0:3, _RESIDUAL] = moved - position
+    rows[:, 6:9, 3:6] = skew(gained)
+    rows[:, 6:9, 6:9], rows[:, 6:9, 21:24] = -R_T, R_T
+    rows[:, 6:9, _TILT] = -duration_s[..., None] * by_tilt
+    rows[:, 6:9, _RESIDUAL] = gained - velocity
+    for part in (slice(0, 3), slice(6, 9)):
+        rows[:, part, 9:12] = -found.by_gyro_bias[:, part]
+        rows[:, part, 12:15] = -found.by_accelerometer_bias[:, part]
+    whitened_rows: FloatArray = factors.whitening @ rows
+    return whitened_rows
+
+
+def _motion_rows(earlier: InertialStates, later: InertialStates, factors: InertialFactors) -> FloatArray:
+    """(K - 1, 9, 33) whitened rows of the motion prior on position, velocity and acceleration, axis by axis."""
+    assert factors.motion is not None  # noqa: S101 (only called without an accelerometer)
+    phi, information = factors.motion
+    roots = np.swapaxes(np.linalg.cholesky(information), 2, 3)
+    rows = np.zeros((len(phi), 9, _COLUMNS))
+    for axis in range(3):
+        own = rows[:, 3 * axis : 3 * axis + 3]
+        columns = np.array([axis, 6 + axis, 12 + axis])
+        own[:, :, columns], own[:, :, 15 + columns] = -roots[:, axis] @ phi, roots[:, axis]
+        before, after = (
+            np.stack(
+                [each.position[:, axis], each.velocity[:, axis], each.bias_or_acceleration[:, axis]], axis=1
+            )
+            for each in (earlier, later)
+        )
+        # Counted from the earlier position, which keeps the digits of short steps.
+        after[:, 0] -= before[:, 0]
+        before[:, 0] = 0.0
+        own[:, :, _RESIDUAL] = matvec(roots[:, axis], after - matvec(phi, before))
+    return rows
+
+
+def _add_walks(
+    knots: InertialStates,
+    factors: InertialFactors,
+    diagonal: FloatArray,
+    off_diagonal: FloatArray,
+    gradient: FloatArray,
+) -> float:
+    """Add the random walks of the biases, in place; return the sum of squared Mahalanobis distances."""
+    cost = 0.0
+    walks = [(slice(9, 12), knots.gyro_bias, factors.walk_information[:, 0])]
+    if factors.with_accelerometer:
+        walks.append((slice(12, 15), knots.bias_or_acceleration, factors.walk_information[:, 1]))
+    for components, bias, information in walks:
+        step = bias[1:] - bias[:-1]
+        weighted = information[:, None] * step
+        np.einsum("kii->ki", diagonal[:-1, components, components])[...] += information[:, None]
+        np.einsum("kii->ki", diagonal[1:, components, components])[...] += information[:, None]
+        np.einsum("kii->ki", off_diagonal[:, components, components])[...] -= information[:, None]
+        gradient[:-1, components] -= weighted
+        gradient[1:, components] += weighted
+        cost += float((weighted * step).sum())
+    return cost
+
+
+def _as_states(
+    knots: InertialStates,
+    kinematics: tuple[FloatArray, FloatArray],
+    gravity: Gravity,
+    factors: InertialFactors,
+) -> States:
+    """States as measurement factors take them: rate and acceleration are those of the samples at the knots."""
+    rate, force = kinematics
+    if factors.with_accelerometer:
+        acceleration = matvec(knots.rotation, force - knots.bias_or_acceleration) + gravity.vector()
+    else:
+        acceleration = knots.bias_or_acceleration
+    zero = np.zeros_like(rate)
+    return States(
+        knots.time_s,
+        knots.position,
+        knots.rotation,
+        knots.velocity,
+        rate - knots.gyro_bias,
+        acceleration,
+        zero,
+    )
+
+
+def _by_inertial_states(rows: FloatArray, *, gyro_only: bool) -> FloatArray:
+    """Rows of measurements by the 18 components of a state without IMU, (M, 3, 19), as rows by those with, (M, 3, 16).
+
+    The acceleration acts over the time from the knot to the measurement, at most 10 ms, over which neither the bias of the
+    accelerometer nor the rotation changes it by what could be measured.
+    """
+    inertial = np.zeros((*rows.shape[:2], INERTIAL_STATE_DIM + 1))
+    inertial[:, :, 0:9] = rows[:, :, 0:9]
+    inertial[:, :, 9:12] = -rows[:, :, 9:12]
+    if gyro_only:
+        inertial[:, :, 12:15] = rows[:, :, 12:15]
+    inertial[:, :, 15] = rows[:, :, 18]
+    return inertial

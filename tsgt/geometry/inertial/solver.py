@@ -1,0 +1,264 @@
+"""Maximum a posteriori trajectory with an IMU, by Gauss-Newton on states at knots. Sans-I/O.
+
+The search and the treatment of outliers are those of ``geometry.trajectory.gauss_newton``; what differs are the factors between
+knots, the tilt of gravity, which borders the system, and the integration of the samples, which is repeated where the bias of the
+gyro has moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tsgt.geometry.inertial.bordered import BorderedCholesky, factorise_bordered
+from tsgt.geometry.inertial.factors import (
+    InertialAnchor,
+    InertialEquations,
+    InertialFactors,
+    assemble_inertial,
+)
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, Gravity, InertialStates
+from tsgt.geometry.rigid import dot
+from tsgt.geometry.trajectory.gauss_newton import (
+    COARSE_NOISE_SCALES,
+    COST_TOLERANCE,
+    INITIAL_POSITION_SIGMA_M,
+    INITIAL_ROTATION_SIGMA_RAD,
+    INITIAL_VELOCITY_SIGMA_MPS,
+    MAX_ITERATIONS,
+    MIN_STEP_FRACTION,
+    OUTLIER_THRESHOLD,
+    PREDICTED_GAIN_TOLERANCE,
+    REJECTION_THRESHOLD,
+    knot_times,
+    nearest_knots,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.inertial.preintegration import ContiguousSamples
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
+    from tsgt.model import ImuNoise, MotionPrior
+
+MAX_KNOT_SPACING_S = 0.5
+"""Knots without measurements are inserted into longer gaps: within one step the biases are constant."""
+
+_MAX_BIAS_ROTATION_RAD = 2e-3
+"""Rotation by a change of the gyro's bias over a step beyond which it is integrated again. To first order the correction
+is wrong by half its square.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class InertialSetup:
+    """Samples of an IMU and how they are used."""
+
+    samples: ContiguousSamples
+    noise: ImuNoise  # That of the samples' densities
+    gyro_only: MotionPrior | None = (
+        None  # Prior of the motion of the states' origin, in place of specific forces
+    )
+
+
+class InertialSolution(NamedTuple):
+    """The maximum a posteriori trajectory; fields not explained here are those of the solution without IMU."""
+
+    knots: InertialStates
+    gravity: Gravity
+    factor: BorderedCholesky
+    squared_distances: FloatArray
+    weights: FloatArray
+    linearised: LinearisedMeasurements
+    knot_index: NDArray[np.intp]
+    cost: float
+    iterations: int
+    factors: InertialFactors
+
+
+def inertial_knot_times(
+    time_s: FloatArray, *, start_s: float | None = None, end_s: float | None = None
+) -> FloatArray:
+    """Choose knot times for measurements at times ``time_s``, at least one; from ``start_s`` to ``end_s`` when given."""
+    times_s = knot_times(time_s)
+    ends = (
+        ([] if start_s is None or start_s >= times_s[0] else [start_s]),
+        ([] if end_s is None or end_s <= times_s[-1] else [end_s]),
+    )
+    times_s = np.concatenate([ends[0], times_s, ends[1]])
+    steps = np.ceil(np.diff(times_s) / MAX_KNOT_SPACING_S - 1e-9).astype(np.int64)
+    parts = [
+        times_s[i] + (times_s[i + 1] - times_s[i]) * np.arange(1, steps[i]) / steps[i]
+        for i in np.flatnonzero(steps > 1)
+    ]
+    return np.sort(np.concatenate([times_s, *parts]))
+
+
+def diffuse_inertial_prior(
+    first: InertialStates, gravity: Gravity, noise: ImuNoise, gyro_only: MotionPrior | None = None
+) -> InertialAnchor:
+    """Prior on the first knot that carries next to no information, but for the biases, and on the tilt."""
+    of_last = (
+        np.full(3, noise.accelerometer_bias_mps2) if gyro_only is None else gyro_only.acceleration_sigma_mps2
+    )
+    sigmas = np.concatenate(
+        [
+            np.full(3, INITIAL_POSITION_SIGMA_M),
+            np.full(3, INITIAL_ROTATION_SIGMA_RAD),
+            np.full(3, INITIAL_VELOCITY_SIGMA_MPS),
+            np.full(3, noise.gyro_bias_radps),
+            of_last,
+            np.full(TILT_DIM, max(gravity.tilt_sigma_rad, 1e-9)),
+        ]
+    )
+    zero = np.zeros((1, 3))
+    about = replace(first, velocity=zero, gyro_bias=zero, bias_or_acceleration=zero)
+    return InertialAnchor(about, np.zeros(TILT_DIM), np.diag(sigmas**-2.0), np.zeros(len(sigmas)))
+
+
+def anchor_at_end(solution: InertialSolution) -> InertialAnchor:
+    """Prior on the last knot of a solution that contains all that its measurements and its anchor say."""
+    information = solution.factor.last_information()
+    return InertialAnchor(
+        solution.knots.select(slice(-1, None)), solution.gravity.tilt, information, np.zeros(len(information))
+    )
+
+
+def solve_inertial(
+    observations: Observations,
+    setup: InertialSetup,
+    guess: InertialStates,
+    gravity: Gravity,
+    *,
+    anchor: InertialAnchor | None = None,
+    factors: InertialFactors | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+    reject_outliers: bool = True,
+) -> InertialSolution:
+    """Find the maximum a posteriori trajectory from observations in any order.
+
+    ``observations``: with the layout in the IMU's axes, from its origin. ``guess``: states at the knot times of the result,
+    rotations within about half a radian of the solution. ``anchor``: prior on the first knot and the tilt; diffuse when not
+    given. ``factors``: between the knots of the guess, when they are at hand. Raises GeometryError: the measurements do not
+    determine the trajectory.
+    """
+    if anchor is None:
+        anchor = diffuse_inertial_prior(guess.select(slice(0, 1)), gravity, setup.noise, setup.gyro_only)
+    if factors is None:
+        factors = InertialFactors.of(setup.samples, guess, setup.noise, gyro_only=setup.gyro_only)
+    knot_index = nearest_knots(guess.time_s, observations.time_s)
+    search = _Search(observations, knot_index, setup, anchor, setup.samples.at(guess.time_s))
+    found = search.minimise(guess, gravity, factors, max_iterations)
+    if not reject_outliers or not (found.squared_distances > REJECTION_THRESHOLD**2).any():
+        return found
+    # As without an IMU: good measurements are outliers of a local minimum, which a coarse search leaves.
+    if max_iterations >= MAX_ITERATIONS:
+        coarse = guess
+        for scale in COARSE_NOISE_SCALES:
+            rough = replace(observations, sigmas_m=scale * observations.sigmas_m)
+            rough_search = replace(search, observations=rough)
+            coarse = rough_search.minimise(coarse, gravity, factors, max_iterations).knots
+        again = search.minimise(coarse, gravity, factors, max_iterations)
+        found = min(found, again, key=lambda solution: solution.cost)
+    rejectable = np.ones(len(knot_index), np.bool_)
+    second = replace(search, rejectable=rejectable).minimise(
+        found.knots, found.gravity, found.factors, max_iterations
+    )
+    return second._replace(iterations=max(found.iterations, second.iterations))
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """One search for the minimum of the cost."""
+
+    observations: Observations
+    knot_index: NDArray[np.intp]
+    setup: InertialSetup
+    anchor: InertialAnchor
+    kinematics: tuple[FloatArray, FloatArray]  # angular rate and specific force at the knots
+    rejectable: NDArray[np.bool_] | None = None
+
+    def minimise(
+        self, knots: InertialStates, gravity: Gravity, factors: InertialFactors, max_iterations: int
+    ) -> InertialSolution:
+        """Run Gauss-Newton with backtracking until the cost or the predicted gain falls below its tolerance."""
+        iterations = 0
+        factors = self._integrated_again(knots, factors)
+        system = self._evaluate(knots, gravity, factors)
+        factor = _factorise(system)
+        while iterations < max_iterations:
+            iterations += 1
+            step, tilt = factor.solve(-system.gradient, -system.corner_gradient)
+            gain = -float(np.vdot(step, system.gradient) + np.vdot(tilt, system.corner_gradient))
+            if gain < PREDICTED_GAIN_TOLERANCE:
+                knots, gravity = knots.retract(step), replace(gravity, tilt=gravity.tilt + tilt)
+                system = _apply_linear_step(system, self.knot_index, step, gain)
+                break
+            fraction = 1.0
+            while fraction > MIN_STEP_FRACTION:
+                moved = knots.retract(fraction * step)
+                moved_gravity = replace(gravity, tilt=gravity.tilt + fraction * tilt)
+                candidate = self._evaluate(moved, moved_gravity, factors)
+                if candidate.cost < system.cost - 0.1 * fraction * gain:
+                    break
+                fraction /= 2.0
+            else:
+                break
+            decrease = system.cost - candidate.cost
+            knots, gravity, system = moved, moved_gravity, candidate
+            integrated = self._integrated_again(knots, factors)
+            if integrated is not factors:
+                factors, decrease = integrated, np.inf
+                system = self._evaluate(knots, gravity, factors)
+            factor = _factorise(system)
+            if decrease < COST_TOLERANCE:
+                break
+        found = system.squared_distances, system.weights, system.linearised, self.knot_index, system.cost
+        return InertialSolution(knots, gravity, factor, *found, iterations, factors)
+
+    def _evaluate(
+        self, knots: InertialStates, gravity: Gravity, factors: InertialFactors
+    ) -> InertialEquations:
+        return assemble_inertial(
+            self.observations,
+            self.knot_index,
+            knots,
+            self.kinematics,
+            gravity,
+            factors,
+            self.anchor,
+            rejectable=self.rejectable,
+        )
+
+    def _integrated_again(self, knots: InertialStates, factors: InertialFactors) -> InertialFactors:
+        """Integrate about the present biases if they have moved too far for the correction to first order."""
+        if len(factors) == 0:
+            return factors
+        found = factors.preintegrated
+        moved = knots.gyro_bias[:-1] - found.gyro_bias
+        if not (np.sqrt(dot(moved, moved)) * found.duration_s > _MAX_BIAS_ROTATION_RAD).any():
+            return factors
+        return InertialFactors.of(self.setup.samples, knots, self.setup.noise, gyro_only=self.setup.gyro_only)
+
+
+def _factorise(system: InertialEquations) -> BorderedCholesky:
+    return factorise_bordered(system.diagonal, system.off_diagonal, system.border, system.corner)
+
+
+def _apply_linear_step(
+    system: InertialEquations, knot_index: NDArray[np.intp], step: FloatArray, gain: float
+) -> InertialEquations:
+    """Apply a small step to residuals, weights and cost; Jacobians stay those before the step."""
+    size = INERTIAL_STATE_DIM
+    residuals = (
+        system.whitened[:, :, size] + (system.whitened[:, :, :size] @ step[knot_index][:, :, None])[:, :, 0]
+    )
+    squared_distances = dot(residuals, residuals)
+    return system._replace(
+        squared_distances=squared_distances,
+        weights=(system.weights > 0) / np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0),
+        cost=system.cost - gain,
+    )

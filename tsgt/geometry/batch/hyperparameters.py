@@ -11,10 +11,16 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import OptimizeResult, minimize
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.batch.adaptive_noise import ADAPTATIONS, adapted_sigmas
+from tsgt.geometry.batch.average_information import (
+    AverageInformation,
+    Variates,
+    measurement_variates,
+    process_variates,
+)
+from tsgt.geometry.batch.evidence_search import Curved, maximise
 from tsgt.geometry.batch.noise_scales import (
     SCALE_SPREAD,
     log_scale_gradient,
@@ -50,6 +56,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory.gauss_newton import Solution
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.states import States
 
@@ -70,8 +77,6 @@ _DEVIATION_LIMITS = np.log([0.7, 10.0])
 _ADAPTED_ITERATIONS = 2  # The next adaptation need not wait for convergence
 _TIME_SCALE_LIMITS = np.log([0.05, 1.0])
 _MEDIAN_SQUARED_DISTANCE = 2.37  # Of the chi-square distribution with 3 degrees of freedom
-_TOLERANCE = 1e-5
-_MAX_STEPS = 40
 _DIFFERENCE_STEP = 1e-3
 
 
@@ -97,6 +102,7 @@ class _Segment:
         self.moving = ~steps_in_rest(self.rest, self.knots.time_s)
         self.local = np.ones((len(self.moving), 6))  # Factors on the variance of the accelerations
         self.log_evidence = -np.inf
+        self.at: tuple[FloatArray, AverageInformation] | None = None  # Parameters of the trajectory
 
     def factors(self, prior: MotionPrior) -> tuple[FloatArray, FloatArray | None]:
         """Acceleration sigmas of each step, (K - 1, 6), and what :func:`rest_factors` gives at rest."""
@@ -129,12 +135,22 @@ class _Segment:
                 adaptable=self.moving,
             )
         self.local = (np.maximum(sigmas, np.minimum(initial, _MIN_SIGMA)) / initial) ** 2
-        self.log_evidence = -np.inf
+        self.log_evidence, self.at = -np.inf, None
 
-    def record(self, knots: States, log_evidence: float) -> None:
+    def guess(self, parameters: FloatArray) -> States:
+        """Guess the trajectory that is most probable with other parameters."""
+        if self.at is None:
+            return self.knots
+        at, information = self.at
+        return self.knots.retract(information.displacement(parameters - at))
+
+    def record(
+        self, knots: States, log_evidence: float, parameters: FloatArray, information: AverageInformation
+    ) -> None:
         """Keep a trajectory if it is more probable."""
         if log_evidence > self.log_evidence:
             self.knots, self.log_evidence = knots, log_evidence
+            self.at = parameters, information
 
 
 def tune(
@@ -178,49 +194,39 @@ def maximise_evidence(
     local: bool = True,
     on_progress: Callable[[int], None] | None = None,
 ) -> Hyperparameters:
-    """Maximise the evidence by L-BFGS-B; bounds and start: parameters of :func:`log_parameters`; as :func:`tune`.
+    """Maximise the evidence; bounds and start: parameters of :func:`log_parameters`; as :func:`tune`.
 
     With ``local`` the process noise varies along the drive, and the evidence is that with its estimate.
     """
     segments = _segments(observations)
     evaluations = 0
-    # Per measurement: the first step of the search is then of order one, a factor of e in a parameter.
-    per_measurement = 1.0 / sum(len(segment.observations) for segment in segments)
 
-    def negative(parameters: FloatArray) -> tuple[float, FloatArray]:
+    def evidence(parameters: FloatArray) -> Curved:
         nonlocal evaluations
         evaluations += 1
         if on_progress is not None:
             on_progress(evaluations)
-        value, gradient = _log_hyperprior(parameters)
+        total = _log_hyperprior(parameters)
         for segment in segments:
-            part, part_gradient = _evidence(segment, parameters)
-            value, gradient = value + part, gradient + part_gradient
-        return -per_measurement * value, -per_measurement * gradient
+            part = _evidence(segment, parameters)
+            total = Curved(
+                total.value + part.value,
+                total.gradient + part.gradient,
+                total.information + part.information,
+            )
+        return total
 
-    def maximise(start: FloatArray) -> OptimizeResult:
-        return minimize(
-            negative,
-            start,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=list(zip(lower, upper, strict=True)),
-            options={"maxiter": _MAX_STEPS, "ftol": _TOLERANCE},
-        )
-
-    found = maximise(start)
+    found, value = maximise(evidence, start, lower, upper)
     if local:
         try:
             for segment in segments:
-                segment.adapt(found.x)
-            found = maximise(found.x)
+                segment.adapt(found)
+            found, value = maximise(evidence, found, lower, upper)
         except GeometryError:
             # Next to no process noise in a calm second, at the lower limit: singular to rounding. The first result holds.
             pass
-    prior, scales = _from_log_parameters(found.x)
-    return Hyperparameters(
-        prior, scales, overall_scale(observations, scales), -float(found.fun) / per_measurement
-    )
+    prior, scales = _from_log_parameters(found)
+    return Hyperparameters(prior, scales, overall_scale(observations, scales), value)
 
 
 def _segments(observations: Observations) -> list[_Segment]:
@@ -282,22 +288,26 @@ def _with_noise(observations: Observations, parameters: FloatArray) -> Observati
     return replace(scale_noise(observations, scales), time_sigma_s=time_sigma_s)
 
 
-def _log_hyperprior(parameters: FloatArray) -> tuple[float, FloatArray]:
-    """Log density of the factors' deviations from the common one, and its gradient."""
-    gradient = np.zeros_like(parameters)
-    deviations = parameters[_SCALE_PARAMETER + 1 : -1] / SCALE_SPREAD
-    gradient[_SCALE_PARAMETER + 1 : -1] = -deviations / SCALE_SPREAD
-    return -0.5 * float(deviations @ deviations), gradient
+def _log_hyperprior(parameters: FloatArray) -> Curved:
+    """Log density of the factors' deviations from the common one."""
+    factors = slice(_SCALE_PARAMETER + 1, -1)
+    gradient, precision = np.zeros_like(parameters), np.zeros_like(parameters)
+    deviations = parameters[factors] / SCALE_SPREAD
+    gradient[factors] = -deviations / SCALE_SPREAD
+    precision[factors] = SCALE_SPREAD**-2.0
+    return Curved(-0.5 * float(deviations @ deviations), gradient, np.diag(precision))
 
 
-def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatArray]:
-    """Log evidence of one segment and its gradient by the log parameters."""
+def _evidence(segment: _Segment, parameters: FloatArray) -> Curved:
+    """Log evidence of one segment by the log parameters."""
     prior, _ = _from_log_parameters(parameters)
     observations = _with_noise(segment.observations, parameters)
     step_sigmas, rest = segment.factors(prior)
-    solution = solve(observations, segment.knots, prior, sigmas=step_sigmas, rest=rest, reject_outliers=False)
+    guess = segment.guess(parameters)
+    solution = solve(observations, guess, prior, sigmas=step_sigmas, rest=rest, reject_outliers=False)
     value = log_evidence(solution, observations, prior, step_sigmas)
-    segment.record(solution.knots, value)
+    information = _average_information(segment, parameters, solution, observations, step_sigmas)
+    segment.record(solution.knots, value, parameters, information)
     covariance, cross_covariance = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
     by_scale, gradient[-1] = log_scale_gradient(solution, observations, covariance)
@@ -323,7 +333,34 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> tuple[float, FloatAr
     first = np.concatenate([solution.knots.acceleration[0], solution.knots.angular_acceleration[0]])
     expected = (first**2 + np.diag(covariance[0])[12:]) / sigmas**2 - 1.0
     np.add.at(gradient, _SIGMA_PARAMETERS, expected)
-    return value, gradient
+    return Curved(value, gradient, information.information)
+
+
+def _average_information(
+    segment: _Segment,
+    parameters: FloatArray,
+    solution: Solution,
+    observations: Observations,
+    step_sigmas: FloatArray,
+) -> AverageInformation:
+    """Average information of the log parameters at a solution."""
+    sigma_parameters, sigma_of_axis = np.unique(_SIGMA_PARAMETERS, return_inverse=True)
+    process = process_variates(
+        solution,
+        step_sigmas,
+        np.exp(parameters[list(_TIME_PARAMETERS)]),
+        sigma_of_axis=sigma_of_axis.tolist(),
+        scaled=segment.moving,
+    )
+    noise = measurement_variates(solution, observations)
+    by_process = np.zeros((len(process.products), len(parameters)))
+    by_process[np.arange(len(by_process)), [*sigma_parameters, *_TIME_PARAMETERS]] = 1.0
+    by_noise = np.zeros((len(noise.products), len(parameters)))
+    by_noise[:-1, _SCALE_PARAMETER] = 1.0
+    by_noise[:, _SCALE_PARAMETER + 1 :] = np.eye(len(by_noise))
+    mixed = process.combined(by_process), noise.combined(by_noise)
+    total = Variates(mixed[0].products + mixed[1].products, mixed[0].right + mixed[1].right)
+    return AverageInformation.of(solution, total)
 
 
 def _expected_log_density(

@@ -11,7 +11,14 @@ import numpy as np
 
 from tsgt.config import SuperframeMasterConfig
 from tsgt.simulation.checks import oversized_collections
-from tsgt.simulation.faults import FAULT_FREE_TAIL_S, draw_faults, inject_fault, relock_instruments
+from tsgt.simulation.faults import (
+    FAULT_FREE_TAIL_S,
+    IMU_FAULTS,
+    draw_faults,
+    imu_conditions,
+    inject_fault,
+    relock_instruments,
+)
 from tsgt.simulation.kernel import VirtualTimeline, run_virtual
 from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult
 
@@ -47,21 +54,24 @@ def simulate(
     timeline = VirtualTimeline()
 
     async def run() -> MissionResult:
-        mission = Mission(scenario, options, folder=folder, timeline=timeline)
-        for station in scenario.stations:
-            mission.start_station(station.station)
-        mission.start_master()
         faults = draw_faults(
             options.faults,
             np.random.default_rng([options.seed, 0xFA]),  # independent of all other draws
             duration_s=options.duration_s,
-            stations=list(mission.station_logs),
+            stations=[station.station for station in scenario.stations],
+            imu=scenario.imu.model != "none",
         )
+        mission = Mission(
+            scenario, options, folder=folder, timeline=timeline, imu_conditions=imu_conditions(faults)
+        )
+        for station in scenario.stations:
+            mission.start_station(station.station)
+        mission.start_master()
         scenario_tasks = [
             *([script(mission)] if script is not None else []),
             *(mission.apply_outage(outage) for outage in options.outages),
             *(mission.restart(restart.station, restart.at_s) for restart in options.restarts),
-            *(inject_fault(mission, fault) for fault in faults),
+            *(inject_fault(mission, fault) for fault in faults if fault.kind not in IMU_FAULTS),
             *([mission.run_interference()] if options.interference_rate_hz else []),
             *([relock_instruments(mission, options.duration_s - FAULT_FREE_TAIL_S)] if faults else []),
         ]
@@ -98,6 +108,7 @@ def simulate(
             faults_end_s=options.duration_s - FAULT_FREE_TAIL_S if faults else None,
             rate_hz={station.station: station.rate_hz for station in scenario.stations},
             oversized_collections=tuple(sorted(oversized)),
+            imu=mission.imu,
         )
 
     return run_virtual(run, timeline, isolated=True)

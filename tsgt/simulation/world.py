@@ -135,6 +135,13 @@ def scenario_world(scenario: ScenarioConfig, duration_s: float, generator: np.ra
     )
 
 
+def is_shaken(scenario: ScenarioConfig) -> bool:
+    """Whether the robot of a scenario is shaken while it drives."""
+    return scenario.shaking.when == "always" or (
+        scenario.shaking.when == "with_imu" and scenario.imu.model != "none"
+    )
+
+
 def draw_occlusions(
     occlusions: Sequence[OcclusionConfig],
     stations: Sequence[int],

@@ -28,6 +28,7 @@ from tsgt.config import (
     ReferencePointConfig,
     ScenarioConfig,
     ScenarioRadioConfig,
+    SimulatedImu,
     SuperframeMasterConfig,
 )
 from tsgt.errors import OutputFileError, TsgtError
@@ -41,6 +42,7 @@ from tsgt.simulation.faults import (
     FAST_SYNC_CYCLES,
     FAULT_FREE_START_S,
     FAULT_FREE_TAIL_S,
+    IMU_FAULTS,
     FaultKind,
     parse_faults,
 )
@@ -49,6 +51,7 @@ from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import MAX_STATIONS, find_scenario, with_stations
 
 if TYPE_CHECKING:
+    from tsgt.config import ImuModelName
     from tsgt.simulation.mission import MissionResult
 
 LISTED_VIOLATIONS = 20
@@ -76,6 +79,13 @@ protocol_option = click.option(
         "--stations",
         type=click.IntRange(1, MAX_STATIONS),
         help="Number of stations; additional ones track the prisms in turn.  [default: that of the scenario]",
+    ),
+    model_option(
+        SimulatedImu,
+        "model",
+        "--imu",
+        default=None,
+        help="Class of the robot's IMU; with one, the robot is shaken while it drives.  [default: that of the scenario]",
     ),
     model_option(
         ScenarioRadioConfig,
@@ -145,6 +155,7 @@ def simulate_command(
     protocol: str,
     duration_s: float | None,
     stations: int | None,
+    model: ImuModelName | None,
     loss_probability: float | None,
     clock_filter: Literal["regression", "paper"] | None,
     unauthenticated: bool,
@@ -177,6 +188,8 @@ def simulate_command(
     scenario = find_scenario(scenario_name)
     if stations is not None:
         scenario = with_stations(scenario, stations)
+    if model is not None:
+        scenario = scenario.model_copy(update={"imu": scenario.imu.model_copy(update={"model": model})})
     if estimator is not None:
         pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
         scenario = scenario.model_copy(update={"pipeline": pipeline})
@@ -193,6 +206,10 @@ def simulate_command(
         radio = scenario.radio.model_copy(update={"loss_probability": loss_probability})
         scenario = scenario.model_copy(update={"radio": radio})
     faults = parse_faults(faults_text)
+    if faults and faults <= IMU_FAULTS and scenario.imu.model == "none":
+        raise click.UsageError(
+            "--faults: these are faults of the IMU, and the robot has none; add --imu industrial"
+        )
     options = SimulationOptions(
         duration_s=scenario.duration_s if duration_s is None else duration_s,
         protocol=_protocol(protocol, clock_filter, fast_sync=bool(faults)),

@@ -1,24 +1,29 @@
 """Faults of a mission: drawn from the seed, injected at their times, removed before the fault-free tail.
 
-In: kinds of faults, a random generator, a running mission. Out: `draw_faults` gives the faults, `inject_fault` applies one.
+In: kinds of faults, a random generator, a running mission. Out: `draw_faults` gives the faults, `inject_fault` applies one;
+`imu_conditions` gives those of the IMU, whose samples are simulated before the mission.
 """
 
 from tsgt.simulation.faults.catalogue import (
     FAST_SYNC_CYCLES,
     FAULT_FREE_START_S,
     FAULT_FREE_TAIL_S,
+    IMU_FAULTS,
     FaultKind,
     draw_faults,
     parse_faults,
 )
+from tsgt.simulation.faults.imu_conditions import imu_conditions
 from tsgt.simulation.faults.injection import inject_fault, relock_instruments
 
 __all__ = [
     "FAST_SYNC_CYCLES",
     "FAULT_FREE_START_S",
     "FAULT_FREE_TAIL_S",
+    "IMU_FAULTS",
     "FaultKind",
     "draw_faults",
+    "imu_conditions",
     "inject_fault",
     "parse_faults",
     "relock_instruments",

@@ -84,6 +84,23 @@ class FaultKind(StrEnum):
     """A stream subscriber stops reading."""
     VANISHING_READER = "vanishing-reader"
     """A stream subscriber aborts its connection."""
+    IMU_DROPOUT = "imu-dropout"
+    """Samples of the IMU are lost at random, up to half of them."""
+    IMU_SILENCE = "imu-silence"
+    """The IMU delivers nothing."""
+    IMU_STUCK = "imu-stuck"
+    """The IMU repeats its last values; its counter and clock run on."""
+    IMU_CLOCK_JUMP = "imu-clock-jump"
+    """The clock of the IMU jumps, by milliseconds to minutes."""
+    IMU_LATE_BURST = "imu-late-burst"
+    """Samples of the IMU are held back and arrive in one burst."""
+    IMU_SATURATION = "imu-saturation"
+    """The motion exceeds the measuring ranges of the IMU."""
+    IMU_KNOCK = "imu-knock"
+    """The IMU is turned by 1 degree and moved by 20 mm on the robot, and stays so."""
+
+
+# Further kinds come last: the draws of the others stay the same.
 
 
 class _FaultRate(NamedTuple):
@@ -94,7 +111,7 @@ class _FaultRate(NamedTuple):
     duration_s: tuple[float, float]
 
 
-_M, _S, _B = "master", "stations", "both"
+_M, _S, _B, _I = "master", "stations", "both", "imu"
 _RATES: Final = {
     FaultKind.LOSS: _FaultRate(40, _S, (0.5, 20)),
     FaultKind.JAMMING: _FaultRate(10, _M, (0.2, 8)),
@@ -121,6 +138,13 @@ _RATES: Final = {
     FaultKind.DISK_READ_ONLY: _FaultRate(4, _B, (0.5, 30)),
     FaultKind.SLOW_READER: _FaultRate(20, _M, (1, 60)),
     FaultKind.VANISHING_READER: _FaultRate(20, _M, (0, 5)),
+    FaultKind.IMU_DROPOUT: _FaultRate(15, _I, (0.5, 30)),
+    FaultKind.IMU_SILENCE: _FaultRate(15, _I, (0.05, 30)),
+    FaultKind.IMU_STUCK: _FaultRate(8, _I, (0.05, 20)),
+    FaultKind.IMU_CLOCK_JUMP: _FaultRate(8, _I, (0, 0)),
+    FaultKind.IMU_LATE_BURST: _FaultRate(15, _I, (0.05, 3)),
+    FaultKind.IMU_SATURATION: _FaultRate(8, _I, (0.5, 20)),
+    FaultKind.IMU_KNOCK: _FaultRate(2, _I, (0, 0)),
 }
 
 RATE_FACTOR = 3.0
@@ -133,9 +157,13 @@ class Fault(NamedTuple):
 
     at_s: float  # start in s from the start of the mission
     kind: FaultKind
-    station: int | None  # None: the master, or the channel
+    station: int | None  # None: the master, its IMU, or the channel
     duration_s: float  # 0: instantaneous
     seed: int  # seed of further draws
+
+
+IMU_FAULTS: Final = frozenset(kind for kind, rate in _RATES.items() if rate.targets == _I)
+"""Kinds of faults that only a robot with an IMU has."""
 
 
 def parse_faults(text: str) -> frozenset[FaultKind]:
@@ -156,22 +184,27 @@ def parse_faults(text: str) -> frozenset[FaultKind]:
 
 
 def draw_faults(
-    kinds: Iterable[FaultKind], rng: np.random.Generator, *, duration_s: float, stations: Sequence[int]
+    kinds: Iterable[FaultKind],
+    rng: np.random.Generator,
+    *,
+    duration_s: float,
+    stations: Sequence[int],
+    imu: bool = False,
 ) -> tuple[Fault, ...]:
-    """Draw the faults of a mission, sorted by start.
+    """Draw the faults of a mission, sorted by start; without an IMU none of :data:`IMU_FAULTS`.
 
     The rate of each kind is scaled by a random factor between 1/8 and 8. With more than one kind, each is omitted with a
     probability of 0.3. All faults end :data:`FAULT_FREE_TAIL_S` before ``duration_s``.
     """
-    ordered = sorted(set(kinds), key=list(FaultKind).index)
+    ordered = sorted(set(kinds) - (frozenset() if imu else IMU_FAULTS), key=list(FaultKind).index)
     end_s = duration_s - FAULT_FREE_TAIL_S
     faults = []
     for kind in ordered:
         factor, omitted = _RATE_SPREAD ** rng.uniform(-1, 1), rng.random() < _OMIT_PROBABILITY
         rate = _RATES[kind]
         for station in [
-            *([None] if rate.targets in (_M, _B) else []),
-            *(stations if rate.targets != _M else []),
+            *([None] if rate.targets in (_M, _B, _I) else []),
+            *(stations if rate.targets in (_S, _B) else []),
         ]:
             count = rng.poisson(
                 max(0.0, RATE_FACTOR * rate.per_hour * factor * (end_s - FAULT_FREE_START_S) / 3600)

@@ -16,6 +16,7 @@ from tsgt.simulation.imu.conditions import (
 )
 from tsgt.simulation.imu.environment import Environment, normal_gravity_mps2
 from tsgt.simulation.imu.presets import CONSUMER, IMU_MODELS, INDUSTRIAL, ImuModel
+from tsgt.simulation.imu.program import ImuProgram
 from tsgt.simulation.imu.samples import DeviceSamples, ImuTruth, Mounting, SimulatedImuRun
 from tsgt.simulation.imu.synthesis import ideal_samples, mounting_of, simulate_imu
 
@@ -29,6 +30,7 @@ __all__ = [
     "Environment",
     "ImuCondition",
     "ImuModel",
+    "ImuProgram",
     "ImuTruth",
     "Knock",
     "LateBurst",

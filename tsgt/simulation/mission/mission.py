@@ -18,6 +18,7 @@ from tsgt.config import SuperframeMasterConfig, scenario_parameters
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
 from tsgt.recording import decode
+from tsgt.simulation.imu import simulate_imu
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import DriftingClock, VirtualClock, drift_ramp
 from tsgt.simulation.lora import Air, TimestampJitter, radio_opener, scenario_link
@@ -33,14 +34,15 @@ from tsgt.simulation.mission.daemon_configs import (
     station_name,
 )
 from tsgt.simulation.mission.run_log import START_UNIX_NS, MasterLog, ObservedInstrument, StationLog
-from tsgt.simulation.world import scenario_world
+from tsgt.simulation.world import is_shaken, scenario_world
 from tsgt.station import ClientDependencies, ClientStatus, run_client
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
 
     from tsgt.config import ScenarioConfig, SimulatedStation
     from tsgt.radio import RadioOpener
+    from tsgt.simulation.imu import ImuCondition, SimulatedImuRun
     from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.options import Outage, SimulationOptions
     from tsgt.simulation.world import World
@@ -58,14 +60,24 @@ INTERFERER = "foreign"
 _OUTAGE_DB = 300.0
 _INTERFERER_POSITION_M = (30.0, -20.0, 1.5)
 _KEY_BYTES = 32
+_SHAKING_SEED = 0x5A
 _YEAR_NS = 365 * 86_400 * 10**9
 
 
 class Mission:
-    """A mission; create and use it in a running event loop on virtual time. Dictionaries are keyed by station number."""
+    """A mission; create and use it in a running event loop on virtual time. Dictionaries are keyed by station number.
+
+    ``imu_conditions``: faults of the robot's IMU.
+    """
 
     def __init__(
-        self, scenario: ScenarioConfig, options: SimulationOptions, *, folder: Path, timeline: Timeline
+        self,
+        scenario: ScenarioConfig,
+        options: SimulationOptions,
+        *,
+        folder: Path,
+        timeline: Timeline,
+        imu_conditions: Sequence[ImuCondition] = (),
     ) -> None:
         rng = np.random.default_rng(options.seed)
         world_rng, air_rng, master_rng, clock_rng, *station_rngs = rng.spawn(4 + len(scenario.stations))
@@ -87,6 +99,19 @@ class Mission:
         self.parameters = scenario_parameters(scenario)
         until_s = options.duration_s + 2 * DRAIN_S
         self.world: World = scenario_world(scenario, until_s, world_rng)  # ground truth on true time
+        # Generators of their own: with shaking and IMU all other draws stay the same.
+        if is_shaken(scenario):
+            shaking_rng = np.random.default_rng([options.seed, _SHAKING_SEED])
+            self.world.shake(scenario.shaking, np.array(scenario.imu.position_m), shaking_rng)
+        self.imu: SimulatedImuRun | None = None  # None: the robot has none
+        if scenario.imu.model != "none":
+            self.imu = simulate_imu(
+                scenario.imu,
+                self.world.motion_at,
+                options.duration_s + DRAIN_S,
+                seed=[options.seed],
+                conditions=imu_conditions,
+            )
         self._positions_m = {station_name(s.station): s.position_m for s in scenario.stations}
         self._positions_m[INTERFERER] = _INTERFERER_POSITION_M
         self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._positions_m, air_rng))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tsgt.config import LeicaInstrumentConfig
     from tsgt.model import Parameters
     from tsgt.simulation.faults.catalogue import FaultKind
+    from tsgt.simulation.imu import SimulatedImuRun
     from tsgt.simulation.instrument import ReportedDistance
     from tsgt.simulation.options import Outage
     from tsgt.simulation.world import World
@@ -302,6 +303,7 @@ class MissionResult:
     faults_end_s: float | None = None  # end of the faults in s from the start; None: no faults
     rate_hz: dict[int, float] = field(default_factory=dict)  # measurement rate by station number
     oversized_collections: tuple[str, ...] = ()  # collections of the daemons that exceeded their bounds
+    imu: SimulatedImuRun | None = None  # samples and truth of the robot's IMU
     start_ns: int = START_UNIX_NS  # unix time of the start on the master's clock, in ns
 
     @property

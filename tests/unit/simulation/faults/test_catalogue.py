@@ -12,7 +12,16 @@ from harness.missions import QUICK, SUPERFRAME, run_mission
 from tsgt.config import ScenarioConfig
 from tsgt.errors import ConfigError
 from tsgt.simulation.checks import check_invariants
-from tsgt.simulation.faults import FAULT_FREE_START_S, FAULT_FREE_TAIL_S, FaultKind, draw_faults, parse_faults
+from tsgt.simulation.faults import (
+    FAULT_FREE_START_S,
+    FAULT_FREE_TAIL_S,
+    IMU_FAULTS,
+    FaultKind,
+    draw_faults,
+    imu_conditions,
+    parse_faults,
+)
+from tsgt.simulation.imu import Knock
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,8 +52,34 @@ def test_faults_end_before_the_fault_free_tail() -> None:
 def test_single_kind_is_never_omitted() -> None:
     """A kind that is requested alone always occurs."""
     for kind in FaultKind:
-        faults = draw_faults([kind], np.random.default_rng(0), duration_s=36_000.0, stations=[1, 2, 3])
+        faults = draw_faults(
+            [kind], np.random.default_rng(0), duration_s=36_000.0, stations=[1, 2, 3], imu=True
+        )
         assert {fault.kind for fault in faults} == {kind}
+
+
+def test_faults_of_the_imu_leave_the_others_as_they_are() -> None:
+    """Without an IMU there are none; with one, all others stay the same, bit for bit."""
+    without, with_imu = (
+        draw_faults(FaultKind, np.random.default_rng(1), duration_s=3600.0, stations=[1, 2, 3], imu=imu)
+        for imu in (False, True)
+    )
+    assert without == tuple(fault for fault in with_imu if fault.kind not in IMU_FAULTS)
+    assert IMU_FAULTS.isdisjoint(fault.kind for fault in without)
+    assert len(with_imu) > len(without)
+
+
+def test_faults_of_the_imu_become_conditions() -> None:
+    """Each has the time and duration of its fault, and a knock its size."""
+    faults = draw_faults(IMU_FAULTS, np.random.default_rng(3), duration_s=36_000.0, stations=[], imu=True)
+    conditions = imu_conditions(faults)
+    assert [condition.at_s for condition in conditions] == [fault.at_s for fault in faults]
+    for condition, fault in zip(conditions, faults, strict=True):
+        assert getattr(condition, "duration_s", 0.0) == fault.duration_s
+        if isinstance(condition, Knock):
+            assert np.degrees(np.linalg.norm(condition.rotation_rad)) == pytest.approx(1.0)
+            assert np.linalg.norm(condition.displacement_m) == pytest.approx(0.020)
+    assert len({type(condition) for condition in conditions}) >= 5
 
 
 def test_kinds_are_parsed() -> None:

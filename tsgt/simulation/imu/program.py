@@ -1,0 +1,111 @@
+"""The program that reads the simulated IMU, as a mission's master starts it: prints JSON lines at their instants."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from tsgt.clock import Clock
+    from tsgt.service import Listener
+    from tsgt.simulation.imu.presets import ImuModel
+    from tsgt.simulation.imu.samples import DeviceSamples
+
+SAMPLES_PER_LINE: Final = 10
+
+MAX_WAIT_S: Final = 0.060
+"""An incomplete line is printed when a sample arrives this long after its first one."""
+
+
+class ImuProgram:
+    """Starts the program any number of times; it prints the samples that arrive while it runs.
+
+    ``clock`` shows true time as CLOCK_MONOTONIC, as the master's does.
+    """
+
+    def __init__(self, model: ImuModel, samples: DeviceSamples, clock: Clock) -> None:
+        self._clock = clock
+        self._hello = _encoded(
+            {
+                "type": "hello",
+                "imu": 1,
+                "make": "Simulated",
+                "rate_hz": model.rate_hz,
+                "clock": "time since start-up",
+                "angular_rate_limit_radps": model.gyro_range_radps,
+                "specific_force_limit_mps2": model.accelerometer_range_mps2,
+            }
+        )
+        self._samples = samples
+        self._starts = _line_starts(samples.arrival_s)
+
+    async def start(self, _command: Sequence[str], listener: Listener) -> RunningImuProgram:
+        """Start the program."""
+        return RunningImuProgram(asyncio.create_task(self._print(listener)))
+
+    async def _print(self, listener: Listener) -> None:
+        listener.output_received(self._hello, self._clock.monotonic_ns())
+        arrival_s = self._samples.arrival_s
+        now_s = self._clock.monotonic_ns() / 1e9
+        first = int(np.searchsorted(arrival_s, now_s))
+        line = int(np.searchsorted(self._starts, first, side="right"))
+        for end in [*self._starts[line:].tolist(), len(arrival_s)]:
+            if end > first:
+                await self._clock.sleep_until(round(arrival_s[end - 1] * 1e9))
+                listener.output_received(self._line(slice(first, end)), self._clock.monotonic_ns())
+            first = end
+        await asyncio.Event().wait()
+
+    def _line(self, rows: slice) -> bytes:
+        samples = self._samples
+        return _encoded(
+            {
+                "type": "samples",
+                "counter": samples.counter[rows].tolist(),
+                "instrument_time_ns": samples.device_ns[rows].tolist(),
+                "host_time_ns": np.rint(samples.arrival_s[rows] * 1e9).astype(np.int64).tolist(),
+                "angular_rate_radps": np.round(samples.angular_rate_radps[rows], 9).tolist(),
+                "specific_force_mps2": np.round(samples.specific_force_mps2[rows], 9).tolist(),
+            }
+        )
+
+
+class RunningImuProgram:
+    """One run of the program; it ends on request, never by itself."""
+
+    def __init__(self, task: asyncio.Task[None]) -> None:
+        self._task = task
+
+    def write(self, data: bytes) -> None:
+        """Ignore what comes on stdin."""
+
+    def kill(self) -> None:
+        """End at once."""
+        self._task.cancel()
+
+    async def terminate(self) -> None:
+        """End."""
+        self._task.cancel()
+        await asyncio.wait([self._task])
+
+
+def _line_starts(arrival_s: NDArray[np.float64]) -> NDArray[np.intp]:
+    """First sample of each line."""
+    starts: list[int] = []
+    first = 0
+    while first < len(arrival_s):
+        starts.append(first)
+        in_time = int(np.searchsorted(arrival_s, arrival_s[first] + MAX_WAIT_S, side="right"))
+        first = max(first + 1, min(first + SAMPLES_PER_LINE, in_time))
+    return np.array(starts, dtype=np.intp)
+
+
+def _encoded(line: dict[str, object]) -> bytes:
+    return json.dumps(line, separators=(",", ":")).encode() + b"\n"

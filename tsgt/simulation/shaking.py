@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 STEP_S = 0.001
 """Interval of the spline's knots: at 60 Hz its second derivative is within 1.2 % of that of the noise."""
 
-PERIOD_S = 65.536
+PERIOD_S = 32.768
 """The noise repeats after this time, which bounds memory; the robot's speed, which scales it, does not."""
 
 FULL_SPEED_MPS = 0.5

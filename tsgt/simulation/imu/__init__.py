@@ -14,7 +14,7 @@ from tsgt.simulation.imu.conditions import (
     Silence,
     StuckValues,
 )
-from tsgt.simulation.imu.environment import Environment, normal_gravity_mps2
+from tsgt.simulation.imu.environment import Environment
 from tsgt.simulation.imu.presets import CONSUMER, IMU_MODELS, INDUSTRIAL, ImuModel
 from tsgt.simulation.imu.program import ImuProgram
 from tsgt.simulation.imu.samples import DeviceSamples, ImuTruth, Mounting, SimulatedImuRun
@@ -41,6 +41,5 @@ __all__ = [
     "StuckValues",
     "ideal_samples",
     "mounting_of",
-    "normal_gravity_mps2",
     "simulate_imu",
 ]

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from tsgt.model import ImuNoise
+from tsgt.config import IMU_NOISE
+
+if TYPE_CHECKING:
+    from tsgt.model import ImuNoise
 
 _DEG = math.radians(1.0)
 _G = 9.80665
 _MG = 1e-3 * _G
-_UG = 1e-6 * _G
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,14 +62,7 @@ class ImuModel:
 
 INDUSTRIAL: Final = ImuModel(
     rate_hz=200.0,
-    noise=ImuNoise(
-        gyro_noise_density=0.005 * _DEG,
-        accelerometer_noise_density=80 * _UG,
-        gyro_bias_walk=0.0005 * _DEG,
-        accelerometer_bias_walk=8 * _UG,
-        gyro_bias_radps=0.15 * _DEG,
-        accelerometer_bias_mps2=3 * _MG,
-    ),
+    noise=IMU_NOISE["industrial"],
     gyro_scale_misalignment=7e-4,
     accelerometer_scale_misalignment=7e-4,
     gyro_g_sensitivity=0.001 * _DEG / _G,
@@ -87,7 +82,7 @@ INDUSTRIAL: Final = ImuModel(
 )
 """Calibrated over temperature in the factory: VectorNav VN-100, Xsens MTi-630 and MTi-300, MicroStrain GX5, ADIS1647x.
 
-Sources, typical values. VN-100 (user manual UM001, section 2): gyro 0.0035 deg/s/sqrt(Hz), accelerometer
+Noise: :data:`tsgt.config.IMU_NOISE`. Sources, typical values. VN-100 (user manual UM001, section 2): gyro 0.0035 deg/s/sqrt(Hz), accelerometer
 0.14 mg/sqrt(Hz), alignment 0.05 deg (9e-4), 16 g, binary output of 32-bit floats with a clock of 1 ns since startup. MTi-630
 (600-series data sheet MT1603P): 0.007 deg/s/sqrt(Hz), 60 ug/sqrt(Hz), g-sensitivity 0.001 deg/s/g, non-orthogonality 0.05 deg, 10 g, bias
 repeatability over a year 0.5 deg/s and 5 mg. MTi-300 (Movella, May 2023): 0.01 deg/s/sqrt(Hz), 60 ug/sqrt(Hz),
@@ -97,14 +92,7 @@ repeatability over a year 0.5 deg/s and 5 mg. MTi-300 (Movella, May 2023): 0.01 
 
 CONSUMER: Final = ImuModel(
     rate_hz=200.0,
-    noise=ImuNoise(
-        gyro_noise_density=0.014 * _DEG,
-        accelerometer_noise_density=190 * _UG,
-        gyro_bias_walk=0.002 * _DEG,
-        accelerometer_bias_walk=30 * _UG,
-        gyro_bias_radps=0.7 * _DEG,
-        accelerometer_bias_mps2=20 * _MG,
-    ),
+    noise=IMU_NOISE["consumer"],
     gyro_scale_misalignment=7e-3,
     accelerometer_scale_misalignment=7e-3,
     gyro_g_sensitivity=0.03 * _DEG / _G,
@@ -124,7 +112,7 @@ CONSUMER: Final = ImuModel(
 )
 """A chip inside a lidar or a camera, uncalibrated: Bosch BMI088, TDK ICM-20948.
 
-Sources, typical values. BMI088 (data sheet BST-BMI088-DS001): gyro 0.014 deg/s/sqrt(Hz), offset 1 deg/s,
+Noise: :data:`tsgt.config.IMU_NOISE`. Sources, typical values. BMI088 (data sheet BST-BMI088-DS001): gyro 0.014 deg/s/sqrt(Hz), offset 1 deg/s,
 0.015 deg/s/K, sensitivity tolerance 1 %, 0.03 %/K, cross axis 1 %, g-sensitivity at most 0.1 deg/s/g; accelerometer 160 to 190 ug/sqrt(Hz),
 offset 20 mg, 0.2 mg/K, 0.002 %/K, cross axis 0.5 %; 16 bits, ranges of 500 deg/s and 6 g; clock ticks of 39.0625 us.
 ICM-20948 (data sheet DS-000189): gyro 0.015 deg/s/sqrt(Hz), 5 deg/s, 1.5 %, cross axis 2 %; accelerometer 230 ug/sqrt(Hz), 0.5 %, cross

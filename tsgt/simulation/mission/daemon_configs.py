@@ -8,6 +8,7 @@ from tsgt.config import (
     ClassicConfig,
     ClassicMasterConfig,
     ClientConfig,
+    ImuConfig,
     JournalConfig,
     LeicaInstrumentConfig,
     MasterConfig,
@@ -72,10 +73,24 @@ def master_config(scenario: ScenarioConfig, options: SimulationOptions, folder: 
         ),
         radio=radio_config(scenario, MASTER, folder),
         protocol=options.protocol,
+        imu=_imu_config(scenario),
         pipeline=scenario.pipeline,
         reference_point=scenario.reference_point,
         stream=StreamConfig(socket=folder / "poses.sock"),
         recording=RecordingConfig(directory=folder, fsync_interval_s=_NO_FSYNC_S),
+    )
+
+
+def _imu_config(scenario: ScenarioConfig) -> ImuConfig | None:
+    imu = scenario.imu
+    if imu.model == "none":
+        return None
+    return ImuConfig(
+        command=("simulated-imu",),  # not run: the mission starts the program
+        position_m=imu.position_m,
+        orientation_xyzw=imu.orientation_xyzw,
+        latitude_deg=imu.latitude_deg,
+        height_m=imu.height_m,
     )
 
 

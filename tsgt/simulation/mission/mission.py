@@ -18,7 +18,7 @@ from tsgt.config import SuperframeMasterConfig, scenario_parameters
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
 from tsgt.recording import decode
-from tsgt.simulation.imu import simulate_imu
+from tsgt.simulation.imu import IMU_MODELS, ImuProgram, simulate_imu
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import DriftingClock, VirtualClock, drift_ramp
 from tsgt.simulation.lora import Air, TimestampJitter, radio_opener, scenario_link
@@ -112,6 +112,7 @@ class Mission:
                 seed=[options.seed],
                 conditions=imu_conditions,
             )
+            self.parameters = replace(self.parameters, imu=self.imu.parameters)
         self._positions_m = {station_name(s.station): s.position_m for s in scenario.stations}
         self._positions_m[INTERFERER] = _INTERFERER_POSITION_M
         self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._positions_m, air_rng))
@@ -223,6 +224,9 @@ class Mission:
         master_log = MasterLog(folder, self._true.monotonic_ns, unix_at_zero_ns)
         self.master_logs.append(master_log)
         config = master_config(self._scenario, self._options, folder)
+        start_imu = None
+        if self.imu is not None:
+            start_imu = ImuProgram(IMU_MODELS[self._scenario.imu.model], self.imu.samples, self.clock).start
         folder.mkdir()
         computer = self.computers[MASTER]
         computer.start(
@@ -236,6 +240,7 @@ class Mission:
                     key=self._key,
                     random_bits=self._random_bits,
                     observe=master_log.observe,
+                    start_imu=start_imu,
                     write=computer.new_writer(),
                 ),
             ),

@@ -18,7 +18,6 @@ from tsgt.simulation.imu import (
     SimulatedImuRun,
     ideal_samples,
     mounting_of,
-    normal_gravity_mps2,
     simulate_imu,
 )
 from tsgt.simulation.rigid_motion import RigidMotion
@@ -115,15 +114,6 @@ def test_earth_rate_and_coriolis() -> None:
     found = ideal_samples(driving, earth, [(0.0, AT_ORIGIN)], END_S, DURATION_S)
     np.testing.assert_allclose(found.angular_rate_radps[:, 2], 7.292115e-5, rtol=1e-12)
     np.testing.assert_allclose(found.specific_force_mps2[:, 1], 20 * 7.292115e-5, rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("latitude_deg", "height_m", "expected"),
-    [(0.0, 0.0, 9.7803253359), (90.0, 0.0, 9.8321849379), (45.0, 1000.0, 9.8031110)],
-)
-def test_normal_gravity(latitude_deg: float, height_m: float, expected: float) -> None:
-    """Published values of WGS 84 at equator and pole; at 45 degrees 9.8061977 less 3.0865 mm/s^2 per km."""
-    assert normal_gravity_mps2(math.radians(latitude_deg), height_m) == pytest.approx(expected, abs=2e-6)
 
 
 @cache

@@ -1,0 +1,77 @@
+"""Missions of a robot with an IMU: its samples reach the recording, and everything else stays as it was."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.missions import SUPERFRAME, run_mission
+
+from tsgt.config import ScenarioConfig, SimulatedImu
+from tsgt.recording import load_recording, read_imu_samples
+from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.scenario_files import with_stations
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.simulation.mission import MissionResult
+
+PIPELINE = ScenarioConfig().pipeline.model_copy(update={"estimator": "linear"})
+WITHOUT = ScenarioConfig(pipeline=PIPELINE)
+WITH = ScenarioConfig(pipeline=PIPELINE, imu=SimulatedImu(model="industrial"))
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
+    """Drive for eight seconds with an IMU."""
+    folder = tmp_path_factory.mktemp("mission")
+    return run_mission(folder, WITH, duration_s=8.0, protocol=SUPERFRAME, seed=0)
+
+
+def test_recording_holds_the_samples_at_their_times(mission: MissionResult) -> None:
+    """All samples are recorded unchanged; their stamps are late by the latency, to a fifth of a millisecond."""
+    assert check_invariants(mission) == []
+    assert mission.imu is not None
+    (log,) = mission.master_logs
+    path = log.recording()
+    assert path is not None
+    records = list(read_imu_samples(path))
+    samples = mission.imu.samples
+    count = sum(len(record.stamp_ns) for record in records)
+    assert count > len(samples) - 20  # the last line is not complete
+    rates = np.concatenate([record.angular_rate_radps for record in records])
+    np.testing.assert_allclose(rates, samples.angular_rate_radps[:count], atol=1e-9)
+    stamps_s = (np.concatenate([record.stamp_ns for record in records]) - log.unix_at_zero_ns) / 1e9
+    late_s = stamps_s - samples.end_s[:count]
+    np.testing.assert_allclose(late_s, mission.imu.truth.latency_s, atol=2e-4)
+    assert load_recording(path).parameters.imu == mission.imu.parameters
+
+
+def test_measurements_are_those_without_an_imu_but_shaken(mission: MissionResult, tmp_path: Path) -> None:
+    """Noise and times stay the same, so that distances differ by the shaking alone."""
+    plain = run_mission(tmp_path, WITHOUT, duration_s=8.0, protocol=SUPERFRAME, seed=0)
+    one, other = (
+        {(m.station, m.sequence): m for m in run.master_logs[0].measurements} for run in (mission, plain)
+    )
+    both = sorted(one.keys() & other.keys())
+    assert len(both) > 40
+    change_m = np.array(
+        [(one[key].slope_distance_m or 0.0) - (other[key].slope_distance_m or 0.0) for key in both]
+    )
+    assert 1e-5 < np.abs(change_m).max() < 3e-3
+    assert mission.imu is not None
+    shaken, still = (run.world.prism_at(np.arange(4.0, 8.0, 0.001), 0) for run in (mission, plain))
+    assert np.abs(shaken - still).max() > np.abs(change_m).max() / 3
+
+
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_mission_with_few_stations(tmp_path: Path, count: int) -> None:
+    """With one or two stations, measurements and samples are recorded without a violation."""
+    run = run_mission(tmp_path, with_stations(WITH, count), duration_s=4.0, protocol=SUPERFRAME, seed=0)
+    assert check_invariants(run) == []
+    assert {m.station for m in run.master_logs[0].measurements} == set(range(1, count + 1))
+    path = run.master_logs[0].recording()
+    assert path is not None
+    assert sum(len(record.stamp_ns) for record in read_imu_samples(path)) > 600

@@ -7,7 +7,14 @@ docs/explanation/imu.md derives the equations.
 from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
+from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
+from tsgt.geometry.inertial.smoother import (
+    InertialFit,
+    estimation_noise,
+    find_start,
+    fit_inertial_trajectory,
+)
 from tsgt.geometry.inertial.solver import (
     MAX_KNOT_SPACING_S,
     InertialSetup,
@@ -32,19 +39,25 @@ __all__ = [
     "HeadingSearch",
     "InertialAnchor",
     "InertialFactors",
+    "InertialFit",
     "InertialSamples",
     "InertialSetup",
     "InertialSolution",
     "InertialStates",
+    "InertialTrajectory",
     "Mounting",
     "Preintegrated",
     "anchor_at_end",
     "concatenate_inertial_states",
     "concatenate_samples",
     "contiguous",
+    "estimation_noise",
+    "find_start",
+    "fit_inertial_trajectory",
     "inertial_knot_times",
     "preintegrate",
     "search_heading",
     "solve_inertial",
     "states_on_tracks",
+    "strapdown",
 ]

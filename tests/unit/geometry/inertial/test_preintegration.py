@@ -120,7 +120,7 @@ def test_analytic_motion() -> None:
 
 def test_covariance_equals_monte_carlo() -> None:
     """The covariance is that of white noise on the samples."""
-    count, draws = 27, 20_000
+    count, draws = 27, 8_000
     rng = np.random.default_rng(1)
     samples = contiguous(shaken(count), NOISE)
     exact = over(samples, 10.0, 10.0 + count * STEP_S)
@@ -144,8 +144,8 @@ def test_covariance_equals_monte_carlo() -> None:
     errors = error(drawn, exact.select(np.zeros(draws, np.intp)))
     root = np.linalg.cholesky(exact.covariance[0])
     whitened = np.linalg.solve(root, errors.T)
-    # Sampling error of a covariance of unit variance: 1 / sqrt(draws) = 0.007.
-    np.testing.assert_allclose(whitened @ whitened.T / draws, np.eye(9), atol=0.04)
+    # Sampling error of a covariance of unit variance: 1 / sqrt(draws) = 0.011.
+    np.testing.assert_allclose(whitened @ whitened.T / draws, np.eye(9), atol=0.06)
     np.testing.assert_allclose(exact.covariance, np.swapaxes(exact.covariance, 1, 2), rtol=0, atol=1e-18)
 
 

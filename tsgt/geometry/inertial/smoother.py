@@ -1,0 +1,234 @@
+"""Trajectory of a whole recording with an IMU, from measurements of three, two or one stations. Sans-I/O.
+
+The search over headings starts the trajectory where the measurements tell the heading. From there the gyro, whose bias is known
+by then, carries the rotation to the next segment, and the prisms' tracks give its positions: with the rotation known, the rest
+is nearly linear. Segments overlap and are solved one after the other, which bounds the memory for the equations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading, states_on_tracks
+from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
+from tsgt.geometry.inertial.query import InertialTrajectory
+from tsgt.geometry.inertial.solver import InertialSetup, inertial_knot_times, solve_inertial
+from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting, concatenate_inertial_states
+from tsgt.geometry.trajectory import nearest_knots
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tsgt.geometry.inertial.initialisation import HeadingSearch
+    from tsgt.geometry.inertial.samples import InertialSamples
+    from tsgt.geometry.inertial.solver import InertialSolution
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory import Observations
+    from tsgt.model import ImuNoise, ImuParameters, MotionPrior
+
+SEGMENT_S = 240.0  # Over which the gyro turns by a few degrees more than it says
+OVERLAP_S = 40.0  # On either side of a segment, solved with it and discarded
+START_GROWTH = 4.0  # Factor on the length that is solved from one start to the next, until it is a segment
+FIRST_SEARCH_S, LONGEST_SEARCH_S = 10.0, 80.0
+"""Length of measurements that the search over headings takes, doubled while they do not tell the heading."""
+
+# What an ideal sensor's data sheet leaves out: shaking between the samples, g-sensitivity, temperature.
+GYRO_DENSITY_FACTOR, MIN_GYRO_DENSITY = 2.0, 1.7e-4
+ACCELEROMETER_DENSITY_FACTOR, MIN_ACCELEROMETER_DENSITY = 3.0, 3e-3
+BIAS_FACTOR = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class InertialFit:
+    """A trajectory with an IMU fitted to measurements; fields not explained here are those of a fit without."""
+
+    trajectory: InertialTrajectory
+    observations: Observations
+    residuals_m: FloatArray
+    squared_distances: FloatArray
+    weights: FloatArray
+    tilt_sigma_rad: float  # One sigma of the tilt of gravity after the fit, the larger of both
+
+
+def estimation_noise(noise: ImuNoise) -> ImuNoise:
+    """Return the noise that the estimator assumes for an IMU with that of its data sheet."""
+    return replace(
+        noise,
+        gyro_noise_density=float(np.hypot(GYRO_DENSITY_FACTOR * noise.gyro_noise_density, MIN_GYRO_DENSITY)),
+        accelerometer_noise_density=float(
+            np.hypot(
+                ACCELEROMETER_DENSITY_FACTOR * noise.accelerometer_noise_density, MIN_ACCELEROMETER_DENSITY
+            )
+        ),
+        **{
+            name: BIAS_FACTOR * getattr(noise, name)
+            for name in (
+                "gyro_bias_walk",
+                "accelerometer_bias_walk",
+                "gyro_bias_radps",
+                "accelerometer_bias_mps2",
+            )
+        },
+    )
+
+
+def fit_inertial_trajectory(
+    observations: Observations,
+    samples: InertialSamples,
+    imu: ImuParameters,
+    *,
+    reference_m: FloatArray,
+    gyro_only: MotionPrior | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> InertialFit:
+    """Fit a trajectory to measurements of any number of prisms and to the samples of an IMU.
+
+    Raises GeometryError: too few measurements, or none tells the heading.
+
+    Parameters
+    ----------
+    observations : In the order of time, with the layout in the axes of the robot; from the first to the last, samples may be
+        missing.
+    reference_m : Origin of that layout, (3,) in the robot frame: the point whose poses the trajectory gives.
+    gyro_only : Do not use the specific forces but this prior of the motion.
+    on_progress : Called with the completed share of the work, 0 to 1.
+    """
+    report_progress = on_progress or (lambda _: None)
+    mounting = Mounting.of(imu, reference_m)
+    of_states = mounting if gyro_only is None else replace(mounting, position=np.zeros(3))
+    mounted = replace(observations, layout=of_states.in_imu(observations.layout))
+    time_s = inertial_knot_times(observations.time_s)
+    noise = estimation_noise(imu.noise)
+    setup = InertialSetup(
+        contiguous(samples, noise, start_s=float(time_s[0]), end_s=float(time_s[-1])), noise, gyro_only
+    )
+    near, gravity = find_start(mounted, setup, Gravity.of(imu))
+    count = max(round(float(time_s[-1] - time_s[0]) / SEGMENT_S), 1)
+    edges_s = np.linspace(time_s[0], time_s[-1], count + 1)
+    ends = [0, *np.searchsorted(time_s, edges_s[1:-1]).tolist(), len(time_s)]
+    knot_index = nearest_knots(time_s, mounted.time_s)
+
+    def solve(start_s: float, end_s: float, near: InertialStates) -> tuple[InertialSolution, int]:
+        solved = slice(*np.searchsorted(time_s, (start_s, np.nextafter(end_s, np.inf))))
+        rows = slice(*np.searchsorted(knot_index, (solved.start, solved.stop)))
+        some = mounted.select(rows)
+        return solve_inertial(some, setup, extended(near, time_s[solved], some, setup), gravity), solved.start
+
+    first = int(np.clip(np.searchsorted(edges_s, near.time_s[0], side="right") - 1, 0, count - 1))
+    while (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
+        if near.time_s[0] <= time_s[0] and near.time_s[-1] >= time_s[-1]:
+            break
+        margin_s = 0.5 * (START_GROWTH - 1.0) * length_s
+        near = solve(near.time_s[0] - margin_s, near.time_s[-1] + margin_s, near)[0].knots
+    parts: dict[int, _Part] = {}
+    for number in [*range(first, count), *range(first - 1, -1, -1)]:
+        report_progress(len(parts) / count)
+        if parts:
+            near = parts[number - 1 if number > first else number + 1].knots
+        solution, offset = solve(edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near)
+        parts[number] = _Part.of(solution, slice(ends[number] - offset, ends[number + 1] - offset))
+    report_progress(1.0)
+    ordered = [parts[number] for number in range(count)]
+    middle = ordered[count // 2]
+    trajectory = InertialTrajectory(
+        concatenate_inertial_states([part.knots for part in ordered]),
+        replace(gravity, tilt=middle.tilt),
+        setup.samples,
+        of_states,
+        np.concatenate([part.covariance for part in ordered]),
+        np.concatenate([part.cross_covariance for part in ordered])[: len(time_s) - 1],
+        gyro_only,
+    )
+    return InertialFit(
+        trajectory,
+        observations,
+        np.concatenate([part.residuals_m for part in ordered]),
+        np.concatenate([part.squared_distances for part in ordered]),
+        np.concatenate([part.weights for part in ordered]),
+        max(part.tilt_sigma_rad for part in ordered),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What is kept of a solved segment: its factor is as large as the rest."""
+
+    knots: InertialStates
+    covariance: FloatArray
+    cross_covariance: FloatArray
+    residuals_m: FloatArray
+    squared_distances: FloatArray
+    weights: FloatArray
+    tilt: FloatArray
+    tilt_sigma_rad: float
+
+    @classmethod
+    def of(cls, solution: InertialSolution, kept: slice) -> _Part:
+        """Return the knots ``kept`` and their measurements."""
+        covariance, cross_covariance = solution.factor.marginals()
+        rows = slice(*np.searchsorted(solution.knot_index, (kept.start, kept.stop)))
+        return cls(
+            solution.knots.select(kept),
+            covariance[kept],
+            cross_covariance[kept],
+            solution.linearised.residuals_m[rows],
+            solution.squared_distances[rows],
+            solution.weights[rows],
+            solution.gravity.tilt,
+            float(np.sqrt(np.diag(solution.factor.shared_covariance).max())),
+        )
+
+
+def find_start(
+    observations: Observations, setup: InertialSetup, gravity: Gravity
+) -> tuple[InertialStates, Gravity]:
+    """Find states where the measurements tell the heading, as early as they do.
+
+    The layout is in the axes of the IMU, from the origin of the states. Raises GeometryError: nowhere.
+    """
+    time_s = observations.time_s
+    begin_s, length_s = float(time_s[0]), FIRST_SEARCH_S
+    best: HeadingSearch | None = None
+    while True:
+        rows = (time_s >= begin_s) & (time_s <= begin_s + length_s)
+        if np.count_nonzero(rows) >= MIN_MEASUREMENTS:
+            best = search_heading(observations.select(rows), setup, gravity)
+            if best.determined:
+                return best.solution.knots, best.solution.gravity
+        if begin_s + length_s >= time_s[-1]:
+            break
+        if length_s < LONGEST_SEARCH_S:
+            length_s *= 2.0
+        else:
+            begin_s += 0.5 * length_s
+    if best is None:
+        raise GeometryError(f"a start needs {MIN_MEASUREMENTS} measurements within {LONGEST_SEARCH_S:.0f} s")
+    raise GeometryError(
+        "the measurements do not tell the heading of the robot: with one station it must accelerate and turn"
+    )
+
+
+def extended(
+    near: InertialStates, time_s: FloatArray, observations: Observations, setup: InertialSetup
+) -> InertialStates:
+    """Guess states at times, (K,), from others close to them, forwards and backwards.
+
+    The gyro turns the nearest of the others, and the tracks of the prisms place the states.
+    """
+    known = int(np.abs(near.time_s - 0.5 * (time_s[0] + time_s[-1])).argmin())
+    known_s, gyro_bias, zero = near.time_s[known], near.gyro_bias[known], np.zeros(3)
+    first = int(np.abs(time_s - known_s).argmin())
+    ends_s = np.sort([known_s, time_s[first]])
+    between = preintegrate(setup.samples, ends_s[:1], ends_s[1:], gyro_bias, zero).rotation[0]
+    found = preintegrate(setup.samples, time_s[:-1], time_s[1:], gyro_bias, zero)
+    rotation = np.empty((len(time_s), 3, 3))
+    rotation[first] = near.rotation[known] @ (between if known_s <= time_s[first] else between.T)
+    for step in range(first, len(time_s) - 1):
+        rotation[step + 1] = rotation[step] @ found.rotation[step]
+    for step in range(first - 1, -1, -1):
+        rotation[step] = rotation[step + 1] @ found.rotation[step].T
+    return states_on_tracks(observations, time_s, rotation, gyro_bias)

@@ -74,21 +74,16 @@ class TargetCalibration:
         return {error: self.network.errors[row, error] for error in ERRORS}
 
     def instrument_errors(self) -> dict[int, InstrumentErrors]:
-        """Estimated errors that also hold for prisms, by station; the range constant is that of the targets."""
+        """Errors that also hold for prisms, by station; the range constant is that of the targets."""
         if not self.applied:
             return {}
         result = {}
         for station in self.network.readings.stations:
-            values = {
-                error: estimate.value
-                for error, estimate in self.errors(station).items()
-                if estimate.estimated
-            }
-            scale = values.get(InstrumentError.RANGE_SCALE)
+            errors = self.errors(station)
             result[station] = InstrumentErrors(
-                vertical_index_rad=values.get(InstrumentError.VERTICAL_INDEX),
-                collimation_rad=values.get(InstrumentError.COLLIMATION),
-                range_scale_ppm=None if scale is None else 1e6 * scale,
+                vertical_index_rad=errors[InstrumentError.VERTICAL_INDEX].value,
+                collimation_rad=errors[InstrumentError.COLLIMATION].value,
+                range_scale_ppm=1e6 * errors[InstrumentError.RANGE_SCALE].value,
             )
         return result
 

@@ -157,11 +157,7 @@ def _written(solved: TargetCalibration, output: Path | None) -> str:
     if not solved.consistent:
         return f"{output} is not written: the targets are inconsistent"
     stations = ", ".join(map(str, (1, *solved.frames)))
-    errors = "".join(
-        f", {key} of station {station}"
-        for station, found in solved.instrument_errors().items()
-        for key in found.table()
-    )
+    errors = ", instrument errors" if solved.instrument_errors() else ""
     return f"{output}: frames of stations {stations}{errors}, target residuals and joint covariance written"
 
 
@@ -240,7 +236,6 @@ def _json(solved: TargetCalibration, notes: list[str], written: str, output: Pat
                 _UNITS[error][0]: {
                     "value": _UNITS[error][1] * estimate.value,
                     "sigma": _UNITS[error][1] * estimate.sigma,
-                    "estimated": estimate.estimated,
                 }
                 for error, estimate in solved.errors(station).items()
             }
@@ -311,12 +306,10 @@ def _print(solved: TargetCalibration) -> None:
         ]
         for station in network.readings.stations
         for error, estimate in solved.errors(station).items()
-        if estimate.estimated
     ]
     click.echo()
-    if rows:
-        print_table(["instrument error, estimated", "value", "sigma"], rows)
-        click.echo()
+    print_table(["instrument error", "value", "sigma"], rows)
+    click.echo()
     print_table(
         ["check", "value", "limit", ""],
         [

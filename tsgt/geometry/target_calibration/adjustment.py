@@ -21,7 +21,6 @@ from tsgt.geometry.target_calibration.causes import (
 from tsgt.geometry.target_calibration.frame_fit import PointPairs, PointSet
 from tsgt.geometry.target_calibration.initialisation import robust_frame
 from tsgt.geometry.target_calibration.network import (
-    COLUMNS,
     DATA_SHEET_SIGMA,
     ERRORS,
     LEVELLED_COLUMNS,
@@ -68,11 +67,10 @@ class FitQuality:
 
 @dataclass(frozen=True, slots=True)
 class ErrorEstimate:
-    """An instrument error: estimated and applied, or zero with the data sheet's sigma."""
+    """An instrument error: estimated with the data sheet's sigma as prior; without, if it is a selected cause."""
 
     value: float
     sigma: float
-    estimated: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,17 +96,13 @@ class NetworkCalibration:
 
     @property
     def unidentified(self) -> tuple[Cause, ...]:
-        """Selected sights for which the readings do not exclude another target or an instrument error, and the reverse.
-
-        Instrument errors within the data sheet are no surprise.
-        """
+        """Selected sights for which the readings do not exclude another target or an instrument error, and the reverse."""
         return tuple(
             cause
             for cause in self.causes
             if (cause.kind is CauseKind.SIGHT and any(_differs(cause, other) for other in cause.alternatives))
             or (
                 cause.kind in (CauseKind.INSTRUMENT, CauseKind.TARGET_CONSTANT)
-                and not cause.within_data_sheet
                 and any(other.kind is CauseKind.SIGHT for other in cause.alternatives)
             )
         )
@@ -129,16 +123,18 @@ def calibrate_network(
     """
     start = _start(readings, noise, levelled=levelled)
     components = LEVELLED_COLUMNS if levelled else POSE_COLUMNS
-    poses = {(row, c): np.inf for row in range(1, len(readings.stations)) for c in components}
+    rows = range(len(readings.stations))
+    known = {(row, c): np.inf for row in rows[1:] for c in components}
+    known |= {(row, 6 + c): DATA_SHEET_SIGMA[error] for row in rows for c, error in enumerate(ERRORS)}
     rules = SelectionRules(STATION_LIMITS.blunder_m, levelled=levelled)
     network = start
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_ROUNDS):
         previous = {cause.label for cause in causes}
         base = network.without_errors()
-        causes = outvoted(readings, select_causes(readings, linearise(readings, base, poses, noise), rules))
+        causes = outvoted(readings, select_causes(readings, linearise(readings, base, known, noise), rules))
         kept = ~_left_out(readings, causes)
-        network, linear = solve(readings.select(kept), base, poses | _freed(causes), noise)
+        network, linear = solve(readings.select(kept), base, known | _freed(causes), noise)
         if {cause.label for cause in causes} == previous:
             break
     while max_residual_m is not None:
@@ -150,10 +146,10 @@ def calibrate_network(
         # Raises if too few are left.
         for points, reference in _kept_sets(readings.select(kept), noise):
             _common(points, reference, levelled=levelled)
-        network, linear = solve(readings.select(kept), network, poses | _freed(causes), noise)
+        network, linear = solve(readings.select(kept), network, known | _freed(causes), noise)
     overall, by_station, by_component = _qualities(readings.select(kept), linear)
     scale = overall.noise_scale if overall.p_value < MISFIT_LEVEL else 1.0
-    columns, covariance = _covariance(linear, len(readings.stations), max(scale, 1.0))
+    columns, covariance = _covariance(linear, max(scale, 1.0))
     return NetworkCalibration(
         readings=readings,
         kept=kept,
@@ -163,8 +159,8 @@ def calibrate_network(
         covariance=covariance,
         scale=max(scale, 1.0),
         causes=causes,
-        suspects=_suspects(readings, network, poses, noise, causes, overall),
-        errors=_errors(network, linear, columns, covariance),
+        suspects=_suspects(readings, network, known, noise, causes, overall, levelled=levelled),
+        errors=_errors(network, columns, covariance),
         overall=overall,
         by_station=by_station,
         by_component=by_component,
@@ -260,9 +256,7 @@ def _freed(causes: Sequence[Cause]) -> dict[Column, float]:
         for each in (cause, *others):
             assert each.error is not None  # noqa: S101 (filtered above)
             column = (each.station, 6 + ERRORS.index(each.error))
-            if each.within_data_sheet:
-                sigma = DATA_SHEET_SIGMA[each.error]
-            elif each is cause and not others:
+            if each is cause and not others:
                 sigma = np.inf
             else:
                 sigma = size if each.error is cause.error else 10 * DATA_SHEET_SIGMA[each.error]
@@ -332,53 +326,47 @@ def _qualities(
     everything = np.ones(len(squares), dtype=bool)
     along, horizontal, vertical = (quality(everything, [column]) for column in range(3))
     return (
-        FitQuality(float(squares.sum()), float(linear.redundancy)),
+        FitQuality(linear.chi_squared, float(linear.redundancy)),
         tuple(quality(readings.station == row, range(3)) for row in range(len(readings.stations))),
         (along, horizontal, vertical),
     )
 
 
-def _covariance(linear: Linearisation, stations: int, scale: float) -> tuple[tuple[Column, ...], FloatArray]:
-    """Joint covariance of the estimated columns and of the instrument errors taken as zero (consider parameters)."""
-    fixed = tuple(
-        (row, 6 + column)
-        for row in range(stations)
-        for column in range(len(ERRORS))
-        if (row, 6 + column) not in linear.active
-    )
-    variances = np.array([DATA_SHEET_SIGMA[ERRORS[column - 6]] ** 2 for _, column in fixed])
-    gain = -linear.covariance @ np.einsum("nia,nif->af", linear.D, linear.columns(fixed))
-    estimated = scale**2 * linear.covariance + (gain * variances) @ gain.T
-    joint = np.block([[estimated, gain * variances], [(gain * variances).T, np.diag(variances)]])
-    return (*linear.active, *fixed), (joint + joint.T) / 2
+def _covariance(linear: Linearisation, scale: float) -> tuple[tuple[Column, ...], FloatArray]:
+    """Joint covariance of poses and instrument errors, for noise ``scale`` times the stated one and priors as they are."""
+    kept = [place for place, column in enumerate(linear.active) if column != TARGET_CONSTANT]
+    given = linear.covariance
+    joint = scale**2 * given - (scale**2 - 1.0) * (given * linear.prior_information) @ given
+    joint = joint[np.ix_(kept, kept)]
+    return tuple(linear.active[place] for place in kept), (joint + joint.T) / 2
 
 
 def _errors(
-    network: Network, linear: Linearisation, columns: tuple[Column, ...], covariance: FloatArray
+    network: Network, columns: tuple[Column, ...], covariance: FloatArray
 ) -> dict[tuple[int, InstrumentError], ErrorEstimate]:
     sigmas = np.sqrt(np.diag(covariance))
     return {
-        (row, ERRORS[component - 6]): ErrorEstimate(
-            float(network.errors[row, component - 6]), float(sigma), (row, component) in linear.active
-        )
+        (row, ERRORS[component - 6]): ErrorEstimate(float(network.errors[row, component - 6]), float(sigma))
         for (row, component), sigma in zip(columns, sigmas, strict=True)
-        if 6 <= component < COLUMNS
+        if component >= 6
     }
 
 
 def _suspects(
     readings: TargetReadings,
     network: Network,
-    poses: dict[Column, float],
+    known: dict[Column, float],
     noise: InstrumentNoise,
     causes: Sequence[Cause],
     overall: FitQuality,
+    *,
+    levelled: bool,
 ) -> tuple[Cause, ...]:
     """Causes that a selection without limits finds beyond the selected ones, if there is a misfit at all."""
     if overall.p_value > MISFIT_LEVEL:
         return ()
-    rules = SelectionRules(0.0, levelled=len(poses) < 6 * (len(readings.stations) - 1))
+    rules = SelectionRules(0.0, levelled=levelled)
     base = network.without_errors()
-    found = select_causes(readings, linearise(readings, base, poses, noise), rules)
-    known = {cause.label for cause in causes}
-    return tuple(cause for cause in found if cause.label not in known)
+    found = select_causes(readings, linearise(readings, base, known, noise), rules)
+    selected = {cause.label for cause in causes}
+    return tuple(cause for cause in found if cause.label not in selected)

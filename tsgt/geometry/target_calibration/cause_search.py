@@ -1,8 +1,7 @@
 """Search for the few causes that explain a misfit: subsets of additional unknowns in a linear least-squares problem.
 
-Each cause is a block of columns. The subset minimises a penalised likelihood, in which the noise is as stated or, at a price,
-of unknown scale: noise larger than stated is not taken for many causes. Two causes that mask each other are found because all
-pairs are tried.
+Each cause is a block of columns. The subset minimises a penalised likelihood. Two causes that mask each other are found
+because all pairs are tried.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 Subset = tuple[int, ...]
 
-NOISE_SCALE_PENALTY = 10.0  # By how much an unknown noise scale must lower twice the negative log-likelihood
 MAX_CAUSES = 8
 BLOCK = 4  # Columns of a cause, at most
 MIN_REDUNDANCY = (
@@ -31,6 +29,13 @@ AMBIGUITY = 9.2
 """Difference of twice the log-likelihood below which an alternative is not excluded: a likelihood ratio of 100."""
 
 
+def exchanged(chosen: Subset, old: Subset, new: Subset) -> Subset:
+    """Return a subset with some causes in place of others."""
+    at = min(chosen.index(each) for each in old)
+    rest = [each for each in chosen if each not in old]
+    return (*rest[:at], *new, *rest[at:])
+
+
 class CauseSearch:
     """Causes of a misfit, by index.
 
@@ -38,11 +43,11 @@ class CauseSearch:
     ----------
     columns, projected : (m, c) whitened columns of all causes, and what least squares leaves of them in the residuals.
     residuals : (m,) whitened, after least squares.
-    redundancy : Degrees of freedom of the residuals.
+    chi_squared : Misfit without any cause.
     blocks : Columns of each cause, at most four.
-    priors : (c,) information of a prior about zero on each column; zero where there is none.
     penalties : By how much each cause must lower twice the negative log-likelihood to be chosen at all.
     odds : Twice the negative logarithm of how probable each cause is; also counts between causes that explain the same.
+    groups : Group of each cause, -1 for none: a second one of a group has no odds against it.
     allowed : Whether a subset may be chosen at all.
     """
 
@@ -52,11 +57,11 @@ class CauseSearch:
         projected: FloatArray,
         residuals: FloatArray,
         *,
-        redundancy: int,
+        chi_squared: float,
         blocks: Sequence[Sequence[int]],
-        priors: FloatArray,
         penalties: FloatArray,
         odds: FloatArray,
+        groups: NDArray[np.intp],
         allowed: Callable[[Subset], bool],
     ) -> None:
         norms = np.sqrt(np.maximum(np.sum(columns**2, axis=0), 1e-300))
@@ -74,26 +79,40 @@ class CauseSearch:
         if places:
             to, of = np.array(places).T
             self._matrix[np.ix_(to, to)] = products[np.ix_(of, of)] + MIN_REDUNDANCY * np.eye(len(to))
-            self._matrix[to, to] += priors[of] / norms[of] ** 2
             self._vector[to] = gains[of]
             self._norms[to] = norms[of]
-        self._chi_squared = float(residuals @ residuals)
-        self._redundancy = max(redundancy, 1)
+        self._chi_squared = chi_squared
         self._count = len(blocks)
         self._penalties = penalties
         self._odds = odds
+        self._members = groups[:, None] == np.arange(max(groups.max(initial=-1) + 1, 1))
+        self._pairs = [
+            pair for pair in combinations(range(len(blocks)), 2) if groups[pair[0]] == groups[pair[1]] >= 0
+        ]
         self._allowed = allowed
 
     def costs(self, subsets: Sequence[Subset]) -> FloatArray:
         """Penalised cost of subsets of one size: twice the negative log-likelihood, up to a constant."""
         index = np.array(subsets, dtype=np.intp).reshape(len(subsets), -1)
-        matrix, vector = self._blocks(index)
-        drop = np.sum(vector * np.linalg.solve(matrix, vector), axis=(1, 2)) if index.shape[1] else 0.0
-        n = self._redundancy
-        rest = np.maximum(self._chi_squared - drop, 1e-9)
-        rescaled = n * (1.0 + np.log(np.maximum(rest / n, 1.0))) + NOISE_SCALE_PENALTY
-        cost: FloatArray = np.minimum(rest, rescaled) + (self._penalties + self._odds)[index].sum(axis=1)
+        cost: FloatArray = self.misfits(index) + self._penalties[index].sum(axis=1) + self._odds_of(index)
         return cost
+
+    def misfits(self, index: NDArray[np.intp]) -> FloatArray:
+        """Chi-square (s,) with subsets (s, k)."""
+        if not index.shape[1]:
+            return np.full(len(index), self._chi_squared)
+        matrix, vector = self._blocks(index)
+        drop = np.sum(vector * np.linalg.solve(matrix, vector), axis=(1, 2))
+        rest: FloatArray = np.maximum(self._chi_squared - drop, 1e-9)
+        return rest
+
+    def _odds_of(self, index: NDArray[np.intp]) -> FloatArray:
+        """Odds of subsets, (s,): of a group only those of its least probable member."""
+        odds = self._odds[index]
+        alone = np.where(self._members[index].any(axis=2), 0.0, odds).sum(axis=1)
+        grouped = (self._members[index] * odds[:, :, None]).max(axis=1, initial=0.0).sum(axis=1)
+        total: FloatArray = alone + grouped
+        return total
 
     def estimates(self, chosen: Subset) -> dict[int, FloatArray]:
         """Return the value (4,) of each chosen cause, in the units of its columns; unused columns are zero."""
@@ -117,18 +136,31 @@ class CauseSearch:
                 return chosen
             chosen, cost = improved
 
-    def alternatives(self, chosen: Subset) -> dict[int, tuple[int, ...]]:
-        """Return by chosen cause the others that explain the same nearly as well, whatever their penalties."""
-        base = float(self.costs([chosen])[0]) - self._penalties[list(chosen)].sum()
+    def alternatives(self, chosen: Subset) -> list[tuple[Subset, Subset]]:
+        """Return which of the chosen causes others may replace that explain nearly as well, whatever their penalties.
+
+        One by one, one by two of a group, and two of a group by one.
+        """
         others = [cause for cause in range(self._count) if cause not in chosen]
-        result: dict[int, tuple[int, ...]] = {}
-        for cause in chosen:
-            exchanged = [tuple(other if each == cause else each for each in chosen) for other in others]
-            if exchanged:
-                costs = self.costs(exchanged) - self._penalties[np.array(exchanged)].sum(axis=1)
-                near = costs < base + AMBIGUITY
-                result[cause] = tuple(other for other, is_near in zip(others, near, strict=True) if is_near)
-        return result
+        by_size: list[list[tuple[Subset, Subset]]] = [
+            [((cause,), (other,)) for cause in chosen for other in others],
+            [((cause,), pair) for cause in chosen for pair in self._pairs if not {*pair} & {*chosen}],
+            [(pair, (other,)) for pair in self._pairs if {*pair} <= {*chosen} for other in others],
+        ]
+        limit = self._likelihoods([chosen])[0] + AMBIGUITY
+        found = []
+        for exchanges in by_size:
+            likelihoods = self._likelihoods([exchanged(chosen, *each) for each in exchanges])
+            found += [each for each, value in zip(exchanges, likelihoods, strict=True) if value < limit]
+        return found
+
+    def _likelihoods(self, subsets: Sequence[Subset]) -> FloatArray:
+        """Twice the negative logarithm of likelihood and odds of subsets of one size, (s,)."""
+        if not subsets:
+            return np.empty(0)
+        index = np.array(subsets, dtype=np.intp)
+        likelihoods: FloatArray = self.misfits(index) + self._odds_of(index)
+        return likelihoods
 
     def _blocks(self, index: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
         """Return normal matrices (s, b, b) and right-hand sides (s, b, 1) of subsets (s, k)."""
@@ -144,6 +176,12 @@ class CauseSearch:
         if len(chosen) + 1 < MAX_CAUSES:
             neighbours.append([(*chosen, *pair) for pair in combinations(others, 2)])
         neighbours.append([(*rest, other) for rest in without for other in others])
+        neighbours.append(
+            [(*rest, *pair) for rest in without for pair in self._pairs if not {*pair} & {*rest}]
+        )
+        if len(chosen) > 1:
+            fewer = [tuple(each for each in chosen if each not in pair) for pair in combinations(chosen, 2)]
+            neighbours.append([(*rest, other) for rest in fewer for other in others])
         found: list[tuple[float, Subset]] = []
         for subsets in neighbours:
             if not subsets:

@@ -6,17 +6,16 @@ an index error is not taken for bad far targets nor the reverse.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
-from tsgt.geometry.target_calibration.cause_search import CauseSearch
+from tsgt.geometry.target_calibration.cause_search import CauseSearch, exchanged
 from tsgt.geometry.target_calibration.network import (
-    DATA_SHEET_SIGMA,
     ERRORS,
     TARGET_CONSTANT,
     InstrumentError,
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.target_calibration.cause_search import Subset
     from tsgt.geometry.target_calibration.network import Linearisation, TargetReadings
 
 
@@ -41,19 +41,29 @@ class CauseKind(StrEnum):
     TILT = "tilt"  # Of a station that is taken as levelled
 
 
-INSTRUMENT_FALSE_ALARM_RATE = 1e-3  # Of any instrument error, in a set that matches its noise model
-DATA_SHEET_FALSE_ALARM_RATE = 0.05  # The same of errors within the data sheet, which every instrument has
-SIGHT_FALSE_ALARM_RATE = 1e-4  # Of any sight; the same for a tripod and a tilt
+NOISE_SCALE_PENALTY = 10.0  # By how much an unknown noise scale must lower twice the negative log-likelihood
+MIN_NOISE_SCALE = 1.1  # Without any cause; below, a larger noise explains nothing
+MAX_NOISE_ROUNDS = 6
+NOISE_SCALE_TOLERANCE = 0.05
 MAX_SIGHTS = 60  # Candidates; of a larger set those with the largest residuals
 ODDS: dict[CauseKind, float] = {
-    CauseKind.INSTRUMENT: 6.0,
+    CauseKind.INSTRUMENT: 4.0,
     CauseKind.TARGET_CONSTANT: 6.0,
-    CauseKind.SIGHT: 6.0,
-    CauseKind.TRIPOD: 10.0,
+    CauseKind.SIGHT: 10.0,
+    CauseKind.TRIPOD: 14.0,
     CauseKind.TILT: 6.0,
 }
-"""Twice the negative logarithm of the odds: one in 20 for a wrong sight or an instrument outside its data sheet, one in 150 for
-a tripod that moves."""
+"""Twice the negative logarithm of the odds: one in 7 for an instrument outside its data sheet, one in 150 for a wrong sight, one in
+1100 for a tripod that moves between two given sights. Of several wrong sights of a station only the first counts."""
+PENALTIES: dict[CauseKind, float] = {
+    CauseKind.INSTRUMENT: 8.0,
+    CauseKind.TARGET_CONSTANT: 8.0,
+    CauseKind.SIGHT: 12.0,
+    CauseKind.TRIPOD: 16.0,
+    CauseKind.TILT: 16.0,
+}
+"""By how much the unknowns of a cause must lower twice the negative log-likelihood, beside the odds: four for each unknown, as many
+causes are tried, and eight at least."""
 LARGEST_ERROR = {
     InstrumentError.VERTICAL_INDEX: 2e-3,
     InstrumentError.COLLIMATION: 2e-3,
@@ -75,9 +85,7 @@ class Cause:
     error: InstrumentError | None = None
     # Only two stations measured the target: which of them is wrong cannot be seen
     either_station: bool = False
-    # INSTRUMENT: an error of the size that the data sheet allows, with its sigma as prior; False: of any size
-    within_data_sheet: bool = False
-    # INSTRUMENT: (1,) its value; TARGET_CONSTANT: (1,) m; SIGHT: (3,) displacement in the first station's frame in m;
+    # INSTRUMENT: (1,) its value beyond what the data sheet explains; TARGET_CONSTANT: (1,) m; SIGHT: (3,) displacement in the first station's frame in m;
     # TRIPOD: (4,) displacement in m and heading in rad; TILT: (2,) rad
     value: FloatArray | None = None
     alternatives: tuple[Cause, ...] = ()  # Causes that the readings do not exclude in its place
@@ -110,10 +118,36 @@ def max_rejected(targets: int) -> int:
     return max((targets - 3) // 2, 0)
 
 
+class _Selection(NamedTuple):
+    causes: tuple[Cause, ...]
+    cost: float  # Twice the negative log-likelihood, penalised, up to a constant
+    noise_scale: float  # Factor on the assumed noise that the residuals show
+
+
 def select_causes(
     readings: TargetReadings, linear: Linearisation, rules: SelectionRules
 ) -> tuple[Cause, ...]:
-    """Select the causes that explain the misfit of a linearisation without any of them."""
+    """Select the causes that explain the misfit of a linearisation without any of them.
+
+    The noise is as stated or, at a price, of unknown scale: noise larger than stated is not taken for many causes.
+    """
+    stated = _selected(readings, linear, rules)
+    redundancy = max(linear.redundancy, 1)
+    scale = float(np.sqrt(np.sum(linear.y * linear.project(linear.y[:, :, None])[:, :, 0]) / redundancy))
+    if scale < MIN_NOISE_SCALE:
+        return stated.causes
+    # From above: with too little noise anything is significant.
+    for _ in range(MAX_NOISE_ROUNDS):
+        scaled = _selected(readings, linear.with_noise(scale), rules)
+        if abs(scaled.noise_scale - 1.0) < NOISE_SCALE_TOLERANCE:
+            break
+        scale = max(scale * scaled.noise_scale, 1.0)
+    cost = scaled.cost + 2.0 * redundancy * math.log(scale) + NOISE_SCALE_PENALTY
+    return scaled.causes if cost < stated.cost else stated.causes
+
+
+def _selected(readings: TargetReadings, linear: Linearisation, rules: SelectionRules) -> _Selection:
+    """Causes with the noise of a linearisation."""
     candidates = _candidates(readings, linear, rules)
     while True:
         columns = np.concatenate([columns for _, columns, _ in candidates], axis=2)
@@ -124,13 +158,13 @@ def select_causes(
             columns.reshape(-1, columns.shape[2]),
             linear.project(columns).reshape(-1, columns.shape[2]),
             residuals.ravel(),
-            redundancy=linear.redundancy,
+            chi_squared=float(np.sum(linear.y * residuals)),
             blocks=[range(a, b) for a, b in pairwise(ends)],
-            priors=np.concatenate(
-                [np.full(columns.shape[2], _prior_information(cause)) for cause, columns, _ in candidates]
-            ),
             penalties=np.array([penalty for _, _, penalty in candidates]),
-            odds=np.array([_odds(cause) for cause in causes]),
+            odds=np.array([ODDS[cause.kind] for cause in causes]),
+            groups=np.array(
+                [cause.station if cause.kind is CauseKind.SIGHT else -1 for cause in causes], np.intp
+            ),
             allowed=lambda subset, causes=causes: _is_possible([causes[row] for row in subset]),  # type: ignore[misc]
         )
         chosen = search.best()
@@ -143,31 +177,39 @@ def select_causes(
     # Of causes that the readings do not tell apart: a tilt fails a check, where an instrument error would be applied; wrong
     # sights are more frequent than tripods that move.
     preferred = {CauseKind.INSTRUMENT: CauseKind.TILT, CauseKind.TRIPOD: CauseKind.SIGHT}
-    exchanged = tuple(
-        next(
-            (other for other in alternatives[row] if causes[other].kind is preferred.get(causes[row].kind)),
-            row,
-        )
-        for row in chosen
-    )
-    if exchanged != chosen and len(set(exchanged)) == len(exchanged):
-        chosen, values = exchanged, search.estimates(exchanged)
+    preferable = {
+        old[0]: new[0]
+        for old, new in reversed(alternatives)
+        if len(old) == len(new) and causes[new[0]].kind is preferred.get(causes[old[0]].kind)
+    }
+    preferable_chosen = tuple(preferable.get(row, row) for row in chosen)
+    if preferable_chosen != chosen and len(set(preferable_chosen)) == len(chosen):
+        chosen, values = preferable_chosen, search.estimates(preferable_chosen)
         alternatives = search.alternatives(chosen)
 
-    def is_alternative(row: int, other: int) -> bool:
-        exchanged = tuple(other if each == row else each for each in chosen)
-        if not _is_possible([causes[each] for each in exchanged]) or causes[other].label == causes[row].label:
+    def is_possible(old: Subset, new: Subset) -> bool:
+        subset = exchanged(chosen, old, new)
+        if not _is_possible([causes[each] for each in subset]):
             return False
-        return _is_plausible(causes[other], search.estimates(exchanged)[other], rules)
+        estimates = search.estimates(subset)
+        return all(_is_plausible(causes[each], estimates[each], rules) for each in new)
 
-    return tuple(
+    possible: dict[int, dict[int, None]] = {row: {} for row in chosen}
+    for old, new in alternatives:
+        if is_possible(old, new):
+            for row in old:
+                possible[row] |= dict.fromkeys(new)
+    found = tuple(
         replace(
             causes[row],
             value=values[row][: ends[row + 1] - ends[row]],
-            alternatives=tuple(causes[other] for other in alternatives[row] if is_alternative(row, other)),
+            alternatives=tuple(causes[other] for other in possible[row]),
         )
         for row in chosen
     )
+    misfit = float(search.misfits(np.array([chosen], np.intp))[0])
+    freedom = linear.redundancy - sum(int(ends[row + 1] - ends[row]) for row in chosen)
+    return _Selection(found, float(search.costs([chosen])[0]), math.sqrt(misfit / max(freedom, 1)))
 
 
 _Candidate = tuple[Cause, "FloatArray", float]  # Cause, columns (n, 3, c), penalty
@@ -175,17 +217,11 @@ _Candidate = tuple[Cause, "FloatArray", float]  # Cause, columns (n, 3, c), pena
 
 def _candidates(readings: TargetReadings, linear: Linearisation, rules: SelectionRules) -> list[_Candidate]:
     stations = range(len(readings.stations))
-    usual, instruments = (
-        [
-            (
-                Cause(CauseKind.INSTRUMENT, station, error=error, within_data_sheet=within),
-                linear.columns(((station, 6 + row),)),
-            )
-            for station in stations
-            for row, error in enumerate(ERRORS)
-        ]
-        for within in (True, False)
-    )
+    instruments = [
+        (Cause(CauseKind.INSTRUMENT, station, error=error), linear.columns(((station, 6 + row),)))
+        for station in stations
+        for row, error in enumerate(ERRORS)
+    ]
     instruments.append((Cause(CauseKind.TARGET_CONSTANT, 0), linear.columns((TARGET_CONSTANT,))))
     sights = _sights(readings, linear)
     tripods = _tripods(readings, linear)
@@ -197,22 +233,9 @@ def _candidates(readings: TargetReadings, linear: Linearisation, rules: Selectio
         if rules.levelled
         else []
     )
-    groups = (
-        (usual, DATA_SHEET_FALSE_ALARM_RATE),
-        (instruments, INSTRUMENT_FALSE_ALARM_RATE),
-        (sights, SIGHT_FALSE_ALARM_RATE),
-        (tripods, SIGHT_FALSE_ALARM_RATE),
-        (tilts, SIGHT_FALSE_ALARM_RATE),
-    )
     return [
-        (
-            cause,
-            columns,
-            float(chdtri(columns.shape[2], rate / len(group)))
-            - (0.0 if group is instruments else _odds(cause)),
-        )
-        for group, rate in groups
-        for cause, columns in group
+        (cause, columns, PENALTIES[cause.kind])
+        for cause, columns in (*instruments, *sights, *tripods, *tilts)
     ]
 
 
@@ -262,15 +285,6 @@ def _is_plausible(cause: Cause, value: FloatArray, rules: SelectionRules) -> boo
     if cause.kind is CauseKind.TARGET_CONSTANT:
         return size <= LARGEST_ERROR[InstrumentError.RANGE_CONSTANT]
     return cause.error is None or size <= LARGEST_ERROR[cause.error]
-
-
-def _prior_information(cause: Cause) -> float:
-    """Information of the data sheet on an instrument error that it allows."""
-    return DATA_SHEET_SIGMA[cause.error] ** -2.0 if cause.error and cause.within_data_sheet else 0.0
-
-
-def _odds(cause: Cause) -> float:
-    return 0.0 if cause.within_data_sheet else ODDS[cause.kind]
 
 
 def _is_possible(causes: Sequence[Cause]) -> bool:

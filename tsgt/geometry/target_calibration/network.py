@@ -172,6 +172,10 @@ class Linearisation:
     prior_information: FloatArray
     prior_distance: FloatArray
 
+    def with_noise(self, scale: float) -> Linearisation:
+        """Return the same for noise larger by a factor; priors are as before."""
+        return replace(self, y=self.y / scale, A=self.A / scale, B=self.B / scale)
+
     def columns(self, which: tuple[Column, ...]) -> FloatArray:
         """(n, 3, c) of these columns of A."""
         rows, components = (list(each) for each in zip(*which, strict=True)) if which else ([], [])
@@ -226,15 +230,21 @@ class Linearisation:
         return active, points
 
     def project(self, values: FloatArray) -> FloatArray:
-        """Residuals (n, 3, c) of values (n, 3, c) after least squares."""
+        """Residuals (n, 3, c) of values (n, 3, c) after least squares; with priors, their products with the inverse covariance."""
         rest = self.reduced(values)
         projected: FloatArray = rest - self.D @ (self.covariance @ np.einsum("nia,nic->ac", self.D, rest))
         return projected
 
     @property
     def redundancy(self) -> int:
-        """Degrees of freedom."""
-        return self.y.size - 3 * len(np.unique(self.target)) - len(self.active)
+        """Degrees of freedom; what has a prior takes none."""
+        free = int(np.count_nonzero(self.prior_information == 0))
+        return self.y.size - 3 * len(np.unique(self.target)) - free
+
+    @property
+    def chi_squared(self) -> float:
+        """Squared normalised residuals, and squared normalised distances from the priors."""
+        return float(np.sum(self.y**2) + self.prior_information @ self.prior_distance**2)
 
 
 def linearise(

@@ -94,8 +94,8 @@ def test_index_error_is_estimated_from_two_faces(tmp_path: Path) -> None:
     np.testing.assert_allclose(both.frames[2].T, plain.frames[2].T, atol=1e-5)
     for errors in both.instrument_errors().values():
         assert errors.vertical_index_rad == pytest.approx(math.radians(0.01), rel=0.01)
-        assert errors.collimation_rad is None
-    assert plain.instrument_errors()[2].vertical_index_rad is None
+        assert errors.collimation_rad == pytest.approx(0.0, abs=1e-6)
+    assert plain.instrument_errors()[2].vertical_index_rad == pytest.approx(0.0, abs=1e-5)
 
 
 def test_constant_in_the_file_overrides_the_default(tmp_path: Path) -> None:

@@ -341,7 +341,7 @@ async def test_progress_shows_counts_and_residuals(
     header, *rows, verdict = out[-6:]
     assert header.split("  ")[0] == "target"
     assert "residual of 2, mm" in header
-    assert rows[0].split() == ["1", "1", "1", "-", "0.1"]
+    assert rows[0].split() == ["1", "1", "1", "-", "0.2"]
     assert rows[3].split() == ["4", "X", "-", "-"]
     assert verdict.startswith("station 2: rms 0.4 mm")
 

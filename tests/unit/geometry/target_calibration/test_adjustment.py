@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.target_calibration import (
+    DATA_SHEET_SIGMA,
     CauseKind,
     InstrumentError,
     NetworkCalibration,
@@ -42,27 +43,29 @@ def sights(calibration: NetworkCalibration) -> set[tuple[int, int | None]]:
 
 
 def test_frames_are_the_least_squares_optimum() -> None:
-    """A general optimiser of the readings themselves, with free target positions, finds the same frames."""
+    """A general optimiser with free target positions and data sheets' priors on the instruments finds the same frames."""
     field = simulated(targets=5, stations=2)
     readings = field.measure()
     solved = calibrate_network(readings, TARGET_NOISE)
     sigmas = readings.sigmas_m(TARGET_NOISE)
-    measured = readings.points_m(np.zeros((2, 4)))
+    sheet = np.array([DATA_SHEET_SIGMA[error] for error in InstrumentError])
 
     def residuals(x: np.ndarray) -> np.ndarray:
+        measured = readings.points_m(sheet * x[6:14].reshape(2, 4))
         rotations = np.stack([np.eye(3), exp_so3(x[3:6]) @ field.rotation[1]])
         translations = np.stack([np.zeros(3), x[:3]])
-        points = x[6:].reshape(-1, 3)[readings.target]
+        points = x[14:].reshape(-1, 3)[readings.target]
         moved = points - translations[readings.station]
         predicted = np.einsum("nji,nj->ni", rotations[readings.station], moved)
-        return np.asarray(np.einsum("nij,nj->ni", readings.axes(), measured - predicted) / sigmas).ravel()
+        misfits = np.einsum("nij,nj->ni", readings.axes(), measured - predicted) / sigmas
+        return np.concatenate([misfits.ravel(), x[6:14]])
 
-    start = np.concatenate([field.translation_m[1], np.zeros(3), field.points_m.ravel()])
+    start = np.concatenate([field.translation_m[1], np.zeros(11), field.points_m.ravel()])
     oracle = least_squares(residuals, start, xtol=1e-15, ftol=1e-15, gtol=1e-15)
     np.testing.assert_allclose(solved.network.translation_m[1], oracle.x[:3], atol=1e-6)
     turn = log_so3(exp_so3(oracle.x[3:6]) @ field.rotation[1] @ solved.network.rotation[1].T)
-    np.testing.assert_allclose(turn, 0, atol=1e-8)
-    assert solved.overall.chi_squared == pytest.approx(2 * oracle.cost)
+    np.testing.assert_allclose(turn, 0, atol=1e-7)
+    assert solved.overall.chi_squared == pytest.approx(2 * oracle.cost, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -85,7 +88,6 @@ def test_instrument_error_is_estimated(error: InstrumentError, value: float, *, 
     (cause,) = solved.causes
     assert (cause.kind, cause.station, cause.error) == (CauseKind.INSTRUMENT, 1, error)
     estimate = solved.errors[1, error]
-    assert estimate.estimated
     assert abs(estimate.value - value) < 3.5 * estimate.sigma < abs(value)
     assert solved.overall.p_value > 0.01
     nees, freedom = frame_nees(solved, field)
@@ -128,7 +130,7 @@ def test_index_error_and_far_targets_are_told_apart() -> None:
     displaced = {(1, 0): SIDEWAYS, (1, 1): np.array([-0.009, 0.003, 0.012])}
     solved = calibrated(3, far=2, targets=14, errors={(1, INDEX): 2e-4}, displaced=displaced)
     assert sights(solved) == set(displaced)
-    assert solved.errors[1, INDEX].estimated
+    assert any(cause.error is INDEX and cause.station == 1 for cause in solved.causes)
 
 
 def test_noise_larger_than_stated_scales_the_sigmas() -> None:

@@ -23,6 +23,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "calibrate": ("calibrate.group:calibrate", "Solve station frames, prism layout and latencies."),
         "status": ("status:status", "Show the status of the daemon on this machine."),
         "listen": ("live:listen", "Print the pose stream as text."),
+        "imu": ("imu:imu", "Read an IMU for the master."),
         "atmosphere": ("atmosphere:atmosphere", "Set temperature and pressure of the instrument."),
     },
     "Desk": {

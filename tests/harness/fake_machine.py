@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from tsgt.doctor import Finding
     from tsgt.radio.sx127x import Hal, Wiring
+    from tsgt.service import StartProgram
     from tsgt.station import ClientStatus
     from tsgt.station.serial import OpenPort, Port
 
@@ -147,6 +148,7 @@ class FakeMachine:
         self.latency_timer_ms: int | None = 1
         self.free_bytes = 30_000_000_000
         self.programs: set[str] = set()
+        self.start_imu: StartProgram | None = None
         self.status: ClientStatus | None = None
         self.served: set[Path] = set()
         self.hal_error: Exception | None = None
@@ -194,6 +196,7 @@ class FakeMachine:
             run=self._run,
             which=lambda program: f"/usr/bin/{program}" if program in self.programs else None,
             free_bytes=lambda _folder: self.free_bytes,
+            start_imu=self.start_imu,
             port_holder=lambda path: self.holders.get(path.name),
             latency_timer_ms=lambda _path: self.latency_timer_ms,
             open_port=lambda _path: self.port,

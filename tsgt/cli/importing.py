@@ -23,6 +23,7 @@ from tsgt.analysis.rts_import import (
     stations_from_targets,
 )
 from tsgt.analysis.setup_replacement import with_calibration, with_layout
+from tsgt.cli.import_imu import import_imu
 from tsgt.cli.options import (
     RECORDING_SUFFIXES,
     OutputFile,
@@ -52,6 +53,8 @@ TARGET_CONSTANT = "--target-constant-mm"
 def import_group() -> None:
     """Convert other formats to a recording."""
 
+
+import_group.add_command(import_imu)
 
 prisms_option = click.option(
     "--prisms",

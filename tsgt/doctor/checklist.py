@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from tsgt.config import ClientConfig, LeicaInstrumentConfig, MasterConfig
 from tsgt.doctor import computer, files, radio, serial_line
 from tsgt.doctor.finding import Finding, failed, note, ok, skipped
+from tsgt.doctor.imu import check_imu
 from tsgt.doctor.instrument import DaemonState, check_instrument
 from tsgt.errors import TsgtError
 
@@ -99,6 +100,7 @@ def _master_checks(
     machine: Machine, path: Path, config: MasterConfig, service: Mapping[str, str] | None, daemon: DaemonState
 ) -> Iterator[tuple[str, Check]]:
     yield "setup", partial(files.check_setup, machine, config)
+    yield "imu", partial(check_imu, machine, config.imu, daemon=daemon.running)
     yield from _common_checks(machine, path, config, service, daemon)
 
 

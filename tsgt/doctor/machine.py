@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.radio.sx127x import Hal, Wiring
+    from tsgt.service import StartProgram
     from tsgt.station import ClientStatus
     from tsgt.station.serial import OpenPort
 
@@ -60,6 +61,7 @@ class Machine:
     free_bytes : Returns the free space of a folder's disk.
     port_holder : Returns the process that has a device open; None if there is none or it is unknown.
     latency_timer_ms : Returns the latency timer of a serial adapter in ms; None without one.
+    start_imu : Starts the program that reads the IMU; None: as a child process.
     open_port, open_hal : Open a serial line; bus and pins of a radio.
     client_status : Returns the status of the client behind a socket; None without one. Raises StreamError if it is stuck.
     serves : Whether a process serves a socket.
@@ -70,6 +72,7 @@ class Machine:
     proc: Path = Path("/proc")
     etc: Path = Path("/etc")
     clock: Clock
+    start_imu: StartProgram | None = None
     user: User
     find_user: Callable[[str, Sequence[str]], User | None]
     group_name: Callable[[int], str]

@@ -1,11 +1,12 @@
 """Measurements to poses, live and from a recording. Sans-I/O; knows neither radio nor files.
 
 In: raw measurements and the parameters in force. Out: poses with covariance, validity and reason, as records or arrays.
-`linear` and `continuous` are the estimators, `live` puts measurements and poses in the order of the stream; `tracks` and
-`observations` apply latency, constants, frames and noise; `pose_batch` and `pose_output` hold and validate poses;
+`linear` and `continuous` are the estimators, `live` puts measurements and poses in the order of the stream; `tracks`,
+`observations` and `inertial` apply latency, constants, frames and noise; `pose_batch` and `pose_output` hold and validate poses;
 `reference_point` carries them to another point of the robot.
 """
 
+from tsgt.estimation.inertial import inertial_samples
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
@@ -58,6 +59,7 @@ __all__ = [
     "centroid_at_point",
     "centroid_point",
     "has_plausible_time",
+    "inertial_samples",
     "instrument_time_sigma_s",
     "measured_at_ns",
     "noise_scales",

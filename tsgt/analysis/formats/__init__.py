@@ -1,11 +1,12 @@
 """File formats of other programs and set-up files, read and written.
 
-Read: RTKLIB solutions, the authors' published tracks, polar tracks (CSV), target and prism files, odometry. Written: TUM,
+Read: samples of an IMU (CSV, ROS 2 bags), RTKLIB solutions, the authors' published tracks, polar tracks (CSV), target and prism files, odometry. Written: TUM,
 CSV, MCAP with ROS 2 messages, set-up files (TOML). A file that cannot be used raises one line with path, line number, what
 was expected and what was found.
 """
 
 from tsgt.analysis.formats.export import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
+from tsgt.analysis.formats.imu_files import FileSample, imu_records, interval_ns, read_imu_file
 from tsgt.analysis.formats.mcap import messages, write_mcap
 from tsgt.analysis.formats.odometry import read_stationary_intervals
 from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, tracked_prisms
@@ -24,6 +25,7 @@ from tsgt.analysis.formats.target_file import (
 __all__ = [
     "QUALITIES",
     "SECOND_NS",
+    "FileSample",
     "InstrumentErrors",
     "PosFile",
     "PrismFile",
@@ -32,9 +34,12 @@ __all__ = [
     "TargetMeasurement",
     "TimeSystem",
     "check_tracks",
+    "imu_records",
+    "interval_ns",
     "measurement_csv",
     "messages",
     "pose_csv",
+    "read_imu_file",
     "read_partial_target_file",
     "read_polar_tracks",
     "read_pos",

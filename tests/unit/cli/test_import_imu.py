@@ -1,0 +1,139 @@
+"""Importing samples of an IMU that another program recorded."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.cli import called
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from tsgt.recording import read_imu_samples
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+COLUMNS = (
+    "stamp_ns,angular_rate_x_radps,angular_rate_y_radps,angular_rate_z_radps,"
+    "specific_force_x_mps2,specific_force_y_mps2,specific_force_z_mps2"
+)
+START_NS = 1_700_000_000_000_000_000
+NUMBERS = [n for n in range(100) if n not in (40, 41)]
+
+
+def write_table(path: Path) -> Path:
+    """Write samples at 200 Hz, two of which are missing."""
+    rows = [f"{START_NS + n * 5_000_000},{n / 1000},0,0.1,0,0,9.81" for n in NUMBERS]
+    path.write_text("\n".join([COLUMNS, *rows]) + "\n")
+    return path
+
+
+def write_bag(path: Path, *topics: str, plugin: StoragePlugin = StoragePlugin.MCAP) -> Path:
+    """Write the same samples as messages."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    covariance = np.zeros(9)
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        for topic in topics:
+            connection = writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=store)
+            for n in NUMBERS:
+                stamp_ns = START_NS + n * 5_000_000
+                message = types["sensor_msgs/msg/Imu"](
+                    header=types["std_msgs/msg/Header"](
+                        stamp=types["builtin_interfaces/msg/Time"](
+                            sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
+                        ),
+                        frame_id="imu",
+                    ),
+                    orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+                    orientation_covariance=covariance,
+                    angular_velocity=types["geometry_msgs/msg/Vector3"](x=n / 1000, y=0.0, z=0.1),
+                    angular_velocity_covariance=covariance,
+                    linear_acceleration=types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=9.81),
+                    linear_acceleration_covariance=covariance,
+                )
+                data = store.serialize_cdr(message, "sensor_msgs/msg/Imu")
+                writer.write(connection, stamp_ns + 7_000_000, data)
+    return path
+
+
+def imported(tmp_path: Path, *arguments: object) -> Path:
+    """Import; check what is printed and the samples."""
+    output = tmp_path / "imu.jsonl"
+    outcome = called("import", "imu", *arguments, "--output", output, "--json")
+    assert outcome.code == 0, outcome.err
+    assert outcome.json() == {"samples": 98, "rate_hz": pytest.approx(200.0), "gaps": 1}
+    records = list(read_imu_samples(output))
+    assert [rate[0] for record in records for rate in record.angular_rate_radps] == [
+        n / 1000 for n in NUMBERS
+    ]
+    assert {duration for record in records for duration in record.duration_ns} == {5_000_000}
+    assert [
+        number
+        for record in records
+        for number in range(record.sequence, record.sequence + len(record.stamp_ns))
+    ] == NUMBERS
+    return output
+
+
+def test_table_is_imported(tmp_path: Path) -> None:
+    """Its times are shifted by the offset."""
+    output = imported(tmp_path, write_table(tmp_path / "imu.csv"), "--offset-ms", "-12.5")
+    first = next(read_imu_samples(output))
+    assert first.stamp_ns[0] == START_NS - 12_500_000
+    assert first.instrument_time_ns is not None
+    assert first.instrument_time_ns[0] == START_NS
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_bag_is_imported(tmp_path: Path, plugin: StoragePlugin) -> None:
+    """By the stamps in the messages, not by those of the bag."""
+    output = imported(tmp_path, write_bag(tmp_path / "bag", "/imu/data", plugin=plugin))
+    assert next(read_imu_samples(output)).stamp_ns[0] == START_NS
+
+
+def test_topic_is_chosen(tmp_path: Path) -> None:
+    """Where there are several."""
+    bag = write_bag(tmp_path / "bag", "/a", "/b")
+    outcome = called("import", "imu", bag, "--output", tmp_path / "imu.jsonl")
+    assert outcome.code == 1
+    assert "has several topics of an IMU: /a, /b; give --topic" in outcome.err
+    imported(tmp_path, bag, "--topic", "/b")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("stamp_ns\n1\n", "expected one column angular_rate_x_radps"),
+        (COLUMNS + "\n1,0,0,5000,0,0,9.8\n", "expected -100 to 100"),
+        (COLUMNS + "\n1,0,0,0,0,0,9.8\n", "fewer than two samples"),
+    ],
+)
+def test_bad_table_is_one_line(tmp_path: Path, text: str, expected: str) -> None:
+    """With what is expected; nothing is written."""
+    path = tmp_path / "imu.csv"
+    path.write_text(text)
+    outcome = called("import", "imu", path, "--output", tmp_path / "imu.jsonl")
+    assert outcome.code == 1
+    assert expected in outcome.err
+    assert not (tmp_path / "imu.jsonl").exists()
+
+
+def test_file_that_is_no_bag_is_one_line(tmp_path: Path) -> None:
+    """With the file's name."""
+    path = tmp_path / "imu.mcap"
+    path.write_bytes(b"garbage")
+    outcome = called("import", "imu", path, "--output", tmp_path / "imu.jsonl")
+    assert outcome.code == 1
+    assert "is no bag of ROS 2 that can be read" in outcome.err
+
+
+def test_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the extra that has it."""
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    outcome = called("import", "imu", tmp_path / "bag", "--output", tmp_path / "imu.jsonl")
+    assert outcome.code == 1
+    assert "pip install 'tsgt[mcap]'" in outcome.err

@@ -1,0 +1,72 @@
+"""The command ``import imu``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+import tsgt
+from tsgt.cli.options import RECORDING_SUFFIXES, FiniteRange, OutputFile, json_option, path_type
+from tsgt.cli.output import print_json, refuse_overwrite
+from tsgt.clock import SystemClock
+from tsgt.recording import RecordingHeader, encode_line, write_atomically
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@click.command("imu")
+@click.argument("files", type=path_type, nargs=-1, required=True)
+@click.option("--topic", help="Topic of sensor_msgs/Imu in a bag.  [default: the only one]")
+@click.option(
+    "--offset-ms",
+    type=FiniteRange(min=-1e9, max=1e9),
+    default=0.0,
+    show_default=True,
+    help="Added to all times: the master's clock less that of the computer that recorded the files.",
+)
+@click.option(
+    "--output",
+    type=OutputFile(*RECORDING_SUFFIXES),
+    required=True,
+    help="File of IMU samples to write (.jsonl), beside a recording; replaced if it exists.",
+)
+@json_option
+def import_imu(
+    *, files: tuple[Path, ...], topic: str | None, offset_ms: float, output: Path, as_json: bool
+) -> None:
+    """Import samples of the robot's IMU that another program recorded.
+
+    FILES are CSV files, or ROS 2 bags (a folder, or an MCAP file) with sensor_msgs/Imu. The columns of a CSV file are
+    stamp_ns or time_s (Unix time), angular_rate_x_radps, _y_, _z_, and specific_force_x_mps2, _y_, _z_, gravity
+    included. Times must be those of the device, not of the arrival: durations are their differences.
+    """
+    from tsgt.analysis.formats import imu_records, interval_ns, read_imu_file
+
+    refuse_overwrite(files, output)
+    samples = sorted(
+        {each.stamp_ns: each for path in files for each in read_imu_file(path, topic)}.values(),
+        key=lambda sample: sample.stamp_ns,
+    )
+    header = RecordingHeader(
+        software=f"tsgt {tsgt.__version__}",
+        created_ns=SystemClock().realtime_ns(),
+        source=f"import imu: {' '.join(path.name for path in files)}",
+    )
+    gaps, expected = 0, 0
+    try:
+        with write_atomically(output) as file:
+            file.write(encode_line(header) + b"\n")
+            for record in imu_records(samples, round(offset_ms * 1e6)):
+                gaps += record.sequence > expected
+                expected = record.sequence + len(record.stamp_ns)
+                file.write(encode_line(record) + b"\n")
+    except ValueError as error:
+        raise click.UsageError(f"--offset-ms: {error}") from error
+    rate_hz = 1e9 / interval_ns(samples)
+    if as_json:
+        print_json({"samples": len(samples), "rate_hz": rate_hz, "gaps": gaps})
+        return
+    duration_s = (samples[-1].stamp_ns - samples[0].stamp_ns) / 1e9
+    click.echo(f"{output}: {len(samples)} samples over {duration_s:.1f} s, {rate_hz:.1f} Hz, {gaps} gaps")

@@ -7,7 +7,7 @@ uncertainty, confidence and repair. docs/reference/diagnosis.md defines them and
 from tsgt.analysis.diagnosis.diagnosis import Diagnosis, diagnose, diagnose_smoothed
 from tsgt.analysis.diagnosis.finding import GEOMETRY, LOCK_LOSS, NOISE, OUTLIERS, TARGETS, Finding
 from tsgt.analysis.diagnosis.held_out_finding import HELD_OUT, Part
-from tsgt.analysis.diagnosis.hypotheses import SetupCause
+from tsgt.geometry.motion_calibration import SetupCause
 
 __all__ = [
     "GEOMETRY",

@@ -7,24 +7,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.diagnosis.hypotheses import Selection, hypotheses, posterior
 from tsgt.analysis.diagnosis.noise_factors import (
     estimate_noise,
     lock_losses,
     single_outliers,
     without_lock_losses,
 )
-from tsgt.analysis.diagnosis.setup_errors import SetupErrors, linearise_setup
 from tsgt.analysis.smoothing import estimate_motion_model
+from tsgt.geometry.motion_calibration import CauseSelection, SetupErrors, cause_hypotheses, linearise_setup
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.analysis.diagnosis.hypotheses import Hypothesis, SelectedCause
     from tsgt.analysis.diagnosis.noise_factors import LockLoss, NoiseEstimate
-    from tsgt.analysis.diagnosis.setup_errors import Linearisation
     from tsgt.analysis.smoothing import MotionModel
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.motion_calibration import CauseHypothesis, LinearisedSetup, SelectedCause
     from tsgt.geometry.trajectory import Observations
     from tsgt.model import Parameters
 
@@ -49,9 +47,9 @@ class Analysis:
     layout: SetupErrors
     causes: tuple[SelectedCause, ...]
     effects_m: tuple[float, ...]
-    single: dict[Hypothesis, float]
+    single: dict[CauseHypothesis, float]
     errors: FloatArray
-    linearised: Linearisation
+    linearised: LinearisedSetup
     noise: NoiseEstimate
     lock_loss: LockLoss | None
     outliers: NDArray[np.intp]
@@ -67,30 +65,30 @@ def analyse(observations: Observations, parameters: Parameters, motion: MotionMo
         tuple(each.station for each in parameters.stations), tuple(each.prism for each in parameters.prisms)
     )
     nominal = layout.nominal_covariance(parameters.setup_covariance)
-    candidates = hypotheses(layout)
+    candidates = cause_hypotheses(layout)
     # Noise from the most general model, as in any regression: a wrong set-up would pass for noise, and hide itself.
     everything = frozenset(candidates)
     errors = np.zeros(len(layout))
     for scale in COARSE_NOISE_SCALES:
         linearised = linearise_setup(layout, observations, errors, motion.prior, scale * floored(motion))
-        prior = Selection(linearised.information, nominal, candidates).prior(everything)
-        errors, _ = posterior(linearised.information, prior)
+        prior = CauseSelection(linearised.information, nominal, candidates).prior(everything)
+        errors, _ = linearised.information.posterior(prior)
     motion = estimate_motion_model(layout.corrected(observations, errors), parameters.pipeline)
     linearised = linearise_setup(layout, observations, errors, motion.prior, floored(motion))
     lock_loss = lock_losses(linearised, estimate_noise(linearised, floored(motion)).normalised)
     if lock_loss is not None:
         observations = without_lock_losses(observations, lock_loss)
         motion = estimate_motion_model(layout.corrected(observations, errors), parameters.pipeline)
-    chosen: frozenset[Hypothesis] | None = None
+    chosen: frozenset[CauseHypothesis] | None = None
     noise = floored(motion)
     for _ in range(MAX_ROUNDS):
         linearised = linearise_setup(layout, observations, errors, motion.prior, noise)
-        selection = Selection(linearised.information, nominal, candidates)
+        selection = CauseSelection(linearised.information, nominal, candidates)
         found = selection.search(chosen or frozenset())
         if found == chosen:
             break
         chosen = found
-        errors, _ = posterior(linearised.information, selection.prior(chosen))
+        errors, _ = linearised.information.posterior(selection.prior(chosen))
     chosen = chosen or frozenset()
     causes = tuple(selection.summarise(chosen))
     estimate = estimate_noise(linearised, noise)
@@ -112,7 +110,7 @@ def floored(motion: MotionModel) -> FloatArray:
     return np.maximum(motion.noise_scales, MIN_NOISE)
 
 
-def _effect_m(linearised: Linearisation, cause: SelectedCause) -> float:
+def _effect_m(linearised: LinearisedSetup, cause: SelectedCause) -> float:
     """Displacement of the measured prisms by a cause, rms over the measurements that it displaces."""
     displaced = linearised.by_errors[:, :, list(cause.hypothesis.rows)] @ cause.estimate
     squared = (displaced**2).sum(axis=1)

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.diagnosis.hypotheses import AMBIGUITY, SetupCause
 from tsgt.analysis.diagnosis.wording import CALIBRATE_MOTION, WORDING
+from tsgt.geometry.motion_calibration import AMBIGUITY, SetupCause
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tsgt.analysis.diagnosis.diagnose import Analysis
-    from tsgt.analysis.diagnosis.hypotheses import Hypothesis, SelectedCause
     from tsgt.analysis.evaluation import InterPrismDistances
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.motion_calibration import CauseHypothesis, SelectedCause
 
 GEOMETRY = "geometry"
 NOISE = "noise"
@@ -63,7 +63,7 @@ class Finding:
     evidence: dict[str, Any] = field(default_factory=dict)
 
 
-def short_name(hypothesis: Hypothesis) -> str:
+def short_name(hypothesis: CauseHypothesis) -> str:
     """Name of a cause in a list."""
     return WORDING[hypothesis.cause].short.format(n=hypothesis.number)
 
@@ -193,7 +193,7 @@ def _pooled(analysis: Analysis) -> list[Finding]:
     ]
 
 
-def _deciding(hypothesis: Hypothesis, alternatives: Iterable[Hypothesis]) -> str:
+def _deciding(hypothesis: CauseHypothesis, alternatives: Iterable[CauseHypothesis]) -> str:
     """Say what would decide between causes; empty if there is but one."""
     causes = list(dict.fromkeys([hypothesis.cause, *(each.cause for each in alternatives)]))
     if not any(True for _ in alternatives):
@@ -201,5 +201,5 @@ def _deciding(hypothesis: Hypothesis, alternatives: Iterable[Hypothesis]) -> str
     return "; or ".join(dict.fromkeys(WORDING[cause].decides for cause in causes[:3]))
 
 
-def _where(hypothesis: Hypothesis) -> str:
+def _where(hypothesis: CauseHypothesis) -> str:
     return f"{'prism' if hypothesis.cause is SetupCause.PRISM else 'station'} {hypothesis.number}"

@@ -11,8 +11,8 @@ from scipy.special import bdtrc
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.analysis.diagnosis.setup_errors import Linearisation
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.motion_calibration import LinearisedSetup
     from tsgt.geometry.trajectory import Observations
 
 GAP_S = 0.9  # A station without measurements for longer has lost its prism
@@ -69,7 +69,7 @@ def near_gaps(observations: Observations) -> tuple[NDArray[np.bool_], NDArray[np
     return gap >= 0, gap
 
 
-def component_noise(linearised: Linearisation, stations: int) -> tuple[FloatArray, FloatArray]:
+def component_noise(linearised: LinearisedSetup, stations: int) -> tuple[FloatArray, FloatArray]:
     """Factors on the noise with which the segments were solved, (S, 3), and their sigmas; 1 and infinity without data.
 
     Variance component estimation (W. Foerstner, ZfV 104, 1979): the sum of squared residuals of a group over its redundancy.
@@ -88,7 +88,7 @@ def component_noise(linearised: Linearisation, stations: int) -> tuple[FloatArra
     return factors, sigmas
 
 
-def estimate_noise(linearised: Linearisation, noise: FloatArray) -> NoiseEstimate:
+def estimate_noise(linearised: LinearisedSetup, noise: FloatArray) -> NoiseEstimate:
     """Estimate the noise at segments that were solved with factors ``noise``, (S, 3), which are close to the result."""
     change, sigmas = component_noise(linearised, len(noise))
     redundancy = np.maximum(linearised.redundancy, MIN_SHARE)
@@ -117,7 +117,7 @@ def without_lock_losses(observations: Observations, loss: LockLoss) -> Observati
     return replace(observations, sigmas_m=sigmas_m)
 
 
-def lock_losses(linearised: Linearisation, normalised: FloatArray) -> LockLoss | None:
+def lock_losses(linearised: LinearisedSetup, normalised: FloatArray) -> LockLoss | None:
     """Whether measurements near gaps are off more often than chance and the others explain; None if not."""
     at_gap, gap = near_gaps(linearised.observations)
     large = np.nanmax(np.where(np.isfinite(normalised), np.abs(normalised), 0.0), axis=1) > LARGE
@@ -133,7 +133,7 @@ def lock_losses(linearised: Linearisation, normalised: FloatArray) -> LockLoss |
     return LockLoss(gaps, every, len(rows), float(np.sqrt(np.mean(size_m**2))), float(size_m.max()), p_value)
 
 
-def single_outliers(linearised: Linearisation, normalised: FloatArray) -> NDArray[np.intp]:
+def single_outliers(linearised: LinearisedSetup, normalised: FloatArray) -> NDArray[np.intp]:
     """Rows of gross errors away from gaps."""
     at_gap, _ = near_gaps(linearised.observations)
     size = np.nanmax(np.where(np.isfinite(normalised), np.abs(normalised), 0.0), axis=1)
@@ -141,7 +141,7 @@ def single_outliers(linearised: Linearisation, normalised: FloatArray) -> NDArra
     return np.flatnonzero(~at_gap & (size > OUTLIER) & large & (linearised.weights < _OUTLIER_WEIGHT))
 
 
-def deviations_m(linearised: Linearisation) -> FloatArray:
+def deviations_m(linearised: LinearisedSetup) -> FloatArray:
     """(M, 3) distance of each measurement from what the others predict: residuals over redundancies."""
     deviations: FloatArray = linearised.residuals_m / np.clip(linearised.redundancy, MIN_SHARE, 1.0)
     return deviations

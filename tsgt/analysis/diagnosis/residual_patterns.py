@@ -10,8 +10,8 @@ import numpy as np
 from tsgt.geometry import cartesian_to_polar
 
 if TYPE_CHECKING:
-    from tsgt.analysis.diagnosis.setup_errors import Linearisation
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.motion_calibration import LinearisedSetup
 
 COMPONENTS = ("range", "horizontal_angle", "zenith_angle")
 REGRESSORS = ("distance", "zenith_cotangent", "speed", "cos_direction", "sin_direction")
@@ -40,7 +40,7 @@ class ResidualPattern:
 
 
 def residual_patterns(
-    linearised: Linearisation, normalised: FloatArray, stations: tuple[int, ...]
+    linearised: LinearisedSetup, normalised: FloatArray, stations: tuple[int, ...]
 ) -> dict[int, dict[str, ResidualPattern]]:
     """Patterns by station number and component; those with too few residuals are missing."""
     horizontal, zenith, distance_m = cartesian_to_polar(linearised.observations.points_m)

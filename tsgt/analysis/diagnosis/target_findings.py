@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from tsgt.analysis.diagnosis.finding import TARGETS, Finding
-from tsgt.analysis.diagnosis.hypotheses import SetupCause
+from tsgt.geometry.motion_calibration import SetupCause
 from tsgt.model import ARCSECOND_RAD
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tsgt.analysis.diagnosis.hypotheses import SetupCause
+from tsgt.geometry.motion_calibration import SetupCause
 
 CALIBRATE_MOTION = "`tsgt calibrate motion RECORDING --output frames.toml`, then `--frames frames.toml` to process and evaluate"
 

@@ -21,6 +21,8 @@ from tsgt.geometry.trajectory import MIN_KNOT_SPACING_S, coupling, initial_guess
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
     from tsgt.geometry.motion_calibration.setup_parameters import Setup, SetupParameters
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory import Observations, Solution, States
@@ -59,28 +61,33 @@ class JointSystem(NamedTuple):
         return total
 
 
-def split_segments(observations: Observations, *, max_segments: int | None = None) -> list[Segment]:
-    """Split measurements, in the order of time, into segments; at most so many, evenly spread.
+def segment_rows(
+    time_s: FloatArray, prism: NDArray[np.intp], *, max_segments: int | None = None
+) -> list[NDArray[np.intp]]:
+    """Rows of measurements, in the order of time, of segments of three prisms or more; at most so many, evenly spread.
 
     Raises GeometryError: too few measurements.
     """
-    time_s = observations.time_s
     count = max(1, round(float(time_s[-1] - time_s[0]) / SEGMENT_S)) if len(time_s) else 0
     edges = np.linspace(time_s[0], time_s[-1], count + 1)[1:-1] if count else ()
     boundaries = np.concatenate(
         [np.searchsorted(time_s, edges), np.flatnonzero(np.diff(time_s) > MAX_GAP_S) + 1]
     )
     rows = np.split(np.arange(len(time_s)), np.unique(boundaries).astype(np.intp))
-    candidates = [Segment(observations.select(some)) for some in rows if len(some) >= MIN_MEASUREMENTS]
-    usable = [segment for segment in candidates if len(np.unique(segment.observations.prism)) >= 3]
+    usable = [some for some in rows if len(some) >= MIN_MEASUREMENTS and len(np.unique(prism[some])) >= 3]
     if not usable:
         raise GeometryError(
-            f"too few measurements to calibrate with: no {SEGMENT_S:.0f} s of them have {MIN_MEASUREMENTS}, "
-            "of at least 3 prisms"
+            f"too few measurements: no {SEGMENT_S:.0f} s of them have {MIN_MEASUREMENTS}, of at least 3 prisms"
         )
     if max_segments is not None and len(usable) > max_segments:
         usable = [usable[i] for i in np.linspace(0, len(usable) - 1, max_segments).round().astype(int)]
     return usable
+
+
+def split_segments(observations: Observations, *, max_segments: int | None = None) -> list[Segment]:
+    """Split measurements, in the order of time, into segments; see :func:`segment_rows`."""
+    rows = segment_rows(observations.time_s, observations.prism, max_segments=max_segments)
+    return [Segment(observations.select(some)) for some in rows]
 
 
 def linearise_jointly(
@@ -98,9 +105,7 @@ def linearise_jointly(
         observations = scale_noise(setup.applied(segment.observations), noise_scale)
         solution = _solve_trajectory(segment, observations, setup, prior)
         by_setup = parameters.jacobian(observations, solution.linearised, setup)
-        information, cross, gradient = normal_equations(observations, solution, by_setup)
-        schur = information - np.tensordot(cross, solution.factor.solve(cross), axes=((0, 1), (0, 1)))
-        eliminated.append(SegmentInformation(schur, gradient))
+        eliminated.append(eliminate_trajectory(observations, solution, by_setup))
         cost += solution.cost
         measurements += len(observations)
         outliers += int(np.count_nonzero(solution.weights < 1.0))
@@ -120,13 +125,22 @@ def _solve_trajectory(
     return solution
 
 
-def normal_equations(
+def eliminate_trajectory(
     observations: Observations, solution: Solution, by_setup: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(G, G) of the set-up, (K, 18, G) of states and set-up, (G,) gradient of the set-up; nothing eliminated.
+) -> SegmentInformation:
+    """Information on the set-up with the trajectory eliminated (Schur complement).
 
     ``by_setup``: (M, 3, G) Jacobian of the residuals at the solution.
     """
+    information, cross, gradient = _normal_equations(observations, solution, by_setup)
+    schur = information - np.tensordot(cross, solution.factor.solve(cross), axes=((0, 1), (0, 1)))
+    return SegmentInformation(schur, gradient)
+
+
+def _normal_equations(
+    observations: Observations, solution: Solution, by_setup: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(G, G) of the set-up, (K, 18, G) of states and set-up, (G,) gradient of the set-up; nothing eliminated."""
     linearised, knots = solution.linearised, solution.knots
     cross = coupling(observations, linearised, solution.weights, solution.knot_index, len(knots), by_setup)
     whitening = np.linalg.inv(np.linalg.cholesky(linearised.covariance(observations)))

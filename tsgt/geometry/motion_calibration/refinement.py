@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import chi2
 
 from tsgt.geometry.batch import tune
 from tsgt.geometry.motion_calibration.hypotheses import Hypothesis, hypotheses
+from tsgt.geometry.motion_calibration.information import Information
 from tsgt.geometry.motion_calibration.joint_system import Segment, linearise_jointly, split_segments
 from tsgt.geometry.motion_calibration.setup_parameters import deformation_modes
 from tsgt.geometry.motion_calibration.setup_prior import factor_of
@@ -76,33 +77,6 @@ class RefinedSetup:
     wander_s: float  # One sigma of each station's latency from segment to segment
     segment_times_s: FloatArray  # (N,) centres of the segments
     motion_prior: MotionPrior  # Tuned with the set-up that fits best if everything may be wrong
-
-
-class _Information(NamedTuple):
-    """Information on the parameters at zero, scaled by the disagreement of the segments."""
-
-    information: FloatArray  # (G, G)
-    gradient: FloatArray  # (G,)
-
-    def evidence(self, factor: FloatArray) -> float:
-        """Log marginal likelihood under a prior's factor, up to a constant."""
-        normal, projected = self.normal(factor), factor.T @ self.gradient
-        quadratic = float(projected @ np.linalg.solve(normal, projected))
-        return 0.5 * (quadratic - float(np.linalg.slogdet(normal)[1]))
-
-    def coordinates(self, factor: FloatArray) -> FloatArray:
-        """(r,) most probable parameters in the coordinates of a prior's factor."""
-        return np.asarray(-np.linalg.solve(self.normal(factor), factor.T @ self.gradient))
-
-    def posterior(self, factor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (G,) and covariance (G, G) of the parameters."""
-        covariance = factor @ np.linalg.inv(self.normal(factor)) @ factor.T
-        return factor @ self.coordinates(factor), 0.5 * (covariance + covariance.T)
-
-    def normal(self, factor: FloatArray) -> FloatArray:
-        """(r, r) normal matrix in the coordinates of a prior's factor."""
-        normal: FloatArray = np.eye(factor.shape[1]) + factor.T @ self.information @ factor
-        return normal
 
 
 def refine_setup(
@@ -168,7 +142,7 @@ def refine_setup(
         setup = parameters.retract(parameters.reference, mean) if used else parameters.reference
     if used:
         # Schmidt: what is not estimated displaces the estimate, by its own uncertainty.
-        displaced = refined @ final.information[:, considered] - np.eye(parameters.count)[:, considered]
+        displaced = refined @ final.matrix[:, considered] - np.eye(parameters.count)[:, considered]
         displaced = displaced @ factor[considered]
         posterior = refined + displaced @ displaced.T
     times_s = np.array([float(np.mean(each.observations.time_s)) for each in segments])
@@ -204,7 +178,7 @@ def _fit(
         found = _without_wander(found, parameters, wander_s)
         total = _total(found, 1.0)
         mean, _ = total.posterior(factor)
-        if iteration == MAX_ITERATIONS - 1 or (mean - at) @ total.information @ (mean - at) < STEP_TOLERANCE:
+        if iteration == MAX_ITERATIONS - 1 or (mean - at) @ total.matrix @ (mean - at) < STEP_TOLERANCE:
             break
         setup = parameters.retract(parameters.reference, mean)
     return setup, found
@@ -233,10 +207,10 @@ def _without_wander(
     return [eliminate_wander(each, parameters.latencies, wander_s).segment for each in segments]
 
 
-def _total(segments: list[SegmentInformation], birge: float) -> _Information:
+def _total(segments: list[SegmentInformation], birge: float) -> Information:
     information = np.sum([each.information for each in segments], axis=0) / birge**2
-    gradient = np.sum([each.gradient for each in segments], axis=0) / birge**2
-    return _Information(0.5 * (information + information.T), gradient)
+    vector = -np.sum([each.gradient for each in segments], axis=0) / birge**2
+    return Information(0.5 * (information + information.T), vector)
 
 
 def _at_optimum(
@@ -257,7 +231,7 @@ def _widened(factor: FloatArray, *added: Hypothesis) -> FloatArray:
 
 
 def _select(
-    total: _Information, nominal: FloatArray, allowed: list[Hypothesis]
+    total: Information, nominal: FloatArray, allowed: list[Hypothesis]
 ) -> tuple[list[Hypothesis], dict[Hypothesis, float]]:
     """Select hypotheses one by one, and return them with the log Bayes factor of each at its turn."""
     gains: dict[Hypothesis, float] = {}
@@ -277,7 +251,7 @@ def _select(
 
 
 def _estimate(
-    total: _Information, nominal: FloatArray, hypothesis: Hypothesis
+    total: Information, nominal: FloatArray, hypothesis: Hypothesis
 ) -> tuple[FloatArray, FloatArray]:
     """Estimate and sigma, (m,) each, of a hypothesis alone."""
     factor = _widened(nominal, hypothesis)
@@ -286,14 +260,14 @@ def _estimate(
     return hypothesis.sigmas * total.coordinates(factor)[-m:], hypothesis.sigmas * np.sqrt(variances)
 
 
-def _p_value(total: _Information, nominal: FloatArray, wide: FloatArray) -> float:
+def _p_value(total: Information, nominal: FloatArray, wide: FloatArray) -> float:
     """Probability of data that agree less with the reference, given its covariance, by chi-square of their gradient.
 
     Only directions on which the data say more than the wide prior count.
     """
-    values, vectors = np.linalg.eigh(wide.T @ total.information @ wide)
+    values, vectors = np.linalg.eigh(wide.T @ total.matrix @ wide)
     directions = wide @ vectors[:, values > 1.0]
-    gradient = directions.T @ total.gradient
-    projected = directions.T @ total.information
+    gradient = directions.T @ total.vector
+    projected = directions.T @ total.matrix
     covariance = projected @ directions + projected @ nominal @ (projected @ nominal).T
     return float(chi2.sf(gradient @ np.linalg.solve(covariance, gradient), len(gradient)))

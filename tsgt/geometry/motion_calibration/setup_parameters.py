@@ -61,12 +61,12 @@ class Setup:
         return replace(
             observations,
             time_s=observations.time_s - self.latencies_s[observations.station],
-            points_m=self._corrected_points(observations),
+            points_m=self.corrected_points(observations),
             frames=self.frames,
             layout=self.layout,
         )
 
-    def _corrected_points(self, observations: Observations) -> FloatArray:
+    def corrected_points(self, observations: Observations) -> FloatArray:
         """(M, 3) measured points without instrument errors."""
         if not self.instrument.any():
             return observations.points_m
@@ -210,15 +210,15 @@ class SetupParameters:
     ) -> FloatArray:
         """(M, 3, G) Jacobian of the residuals, of observations with this set-up, by the parameters."""
         jacobian = np.zeros((len(observations), 3, self.count))
-        lever_arms = skew(linearised.point_m - self.pivot)
         each = np.arange(3)
+        by_displacement = by_displacements(linearised, self.pivot)
+        by_latency = -matvec(linearised.by_point, linearised.velocity_mps)
         for i, station in enumerate(self.stations):
             rows = np.flatnonzero(observations.station == station)
-            by_point = linearised.by_point[rows]
-            jacobian[np.ix_(rows, each, self.translations[i])] = -by_point
-            jacobian[np.ix_(rows, each, self.rotations[i])] = by_point @ lever_arms[rows]
-            jacobian[rows, :, self.latencies[i]] = -matvec(by_point, linearised.velocity_mps[rows])
-        by_instrument = _by_instrument_errors(observations, linearised, setup)
+            displaced = [*self.translations[i], *self.rotations[i]]
+            jacobian[np.ix_(rows, each, displaced)] = by_displacement[rows]
+            jacobian[rows, :, self.latencies[i]] = by_latency[rows]
+        by_instrument = by_instrument_errors(observations, linearised, setup)
         for i, station in enumerate(self.measured):
             rows = np.flatnonzero(observations.station == station)
             jacobian[np.ix_(rows, each, self.instrument[i])] = by_instrument[rows]
@@ -247,7 +247,13 @@ class SetupParameters:
         return jacobian
 
 
-def _by_instrument_errors(
+def by_displacements(linearised: LinearisedMeasurements, pivot: FloatArray) -> FloatArray:
+    """(M, 3, 6) Jacobian of the residuals by a displacement of the station: translation, and rotation about (M, 3) or (3,)."""
+    by_rotation = linearised.by_point @ skew(linearised.point_m - pivot)
+    return np.concatenate([-linearised.by_point, by_rotation], axis=2)
+
+
+def by_instrument_errors(
     observations: Observations, linearised: LinearisedMeasurements, setup: Setup
 ) -> FloatArray:
     """(M, 3, 4) Jacobian of the residuals by the instrument errors of the station; zero for Cartesian points."""

@@ -19,8 +19,8 @@ from tsgt.analysis.diagnosis.noise_factors import (
     near_gaps,
     single_outliers,
 )
-from tsgt.analysis.diagnosis.setup_errors import Linearisation
 from tsgt.analysis.diagnosis.target_findings import calibration_findings
+from tsgt.geometry.motion_calibration import LinearisedSetup
 from tsgt.geometry.trajectory import Observations
 from tsgt.model import SetupCovariance, TargetResidual
 
@@ -32,7 +32,7 @@ SIGMA_M = 0.002
 GAPS = 6
 
 
-def solved(seed: int = 0, count: int = 300) -> Linearisation:
+def solved(seed: int = 0, count: int = 300) -> LinearisedSetup:
     """Return residuals of three stations as noise makes them; each station has a gap of 3 s every 20 s."""
     rng = np.random.default_rng(seed)
     time_s = np.sort(rng.uniform(0.0, 20.0 * GAPS, 3 * count))
@@ -50,7 +50,7 @@ def solved(seed: int = 0, count: int = 300) -> Linearisation:
         layout=np.eye(3),
     )
     redundancy = np.full((len(time_s), 3), 0.5)
-    return Linearisation(
+    return LinearisedSetup(
         [],
         observations,
         rng.normal(scale=SIGMA_M * math.sqrt(0.5), size=(len(time_s), 3)),
@@ -62,7 +62,7 @@ def solved(seed: int = 0, count: int = 300) -> Linearisation:
     )
 
 
-def losses(linearised: Linearisation) -> LockLoss | None:
+def losses(linearised: LinearisedSetup) -> LockLoss | None:
     """Losses of lock with the noise of the residuals themselves."""
     return lock_losses(linearised, estimate_noise(linearised, np.ones((3, 3))).normalised)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from harness.prior_motion import draw_motions, measure, sorted_by_time
 
-from tsgt.analysis.diagnosis.setup_errors import (
+from tsgt.geometry.motion_calibration.setup_errors import (
     FRAME,
     STATION_COMPONENTS,
     SetupErrors,

@@ -8,20 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from tsgt.analysis.diagnosis.hypotheses import (
-    Selection,
-    SetupCause,
-    hypotheses,
-    log_evidence,
-    posterior,
-)
-from tsgt.analysis.diagnosis.setup_errors import Information, SetupErrors
+from tsgt.geometry.motion_calibration import CauseSelection, SetupCause, SetupErrors, cause_hypotheses
+from tsgt.geometry.motion_calibration.information import Information
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 LAYOUT = SetupErrors((1, 2, 3), (1, 2, 3))
-CANDIDATES = hypotheses(LAYOUT)
+CANDIDATES = cause_hypotheses(LAYOUT)
 NOMINAL = LAYOUT.nominal_covariance(None)
 
 
@@ -49,8 +43,9 @@ def test_evidence_is_the_ratio_of_densities() -> None:
     expected = multivariate_normal(cov=prior + noise).logpdf(measured) - multivariate_normal(
         cov=noise
     ).logpdf(measured)
-    assert log_evidence(information, prior) == pytest.approx(expected)
-    mean, covariance = posterior(information, prior)
+    factor = np.asarray(np.linalg.cholesky(prior), np.float64)
+    assert information.evidence(factor) == pytest.approx(expected)
+    mean, covariance = information.posterior(factor)
     assert mean == pytest.approx(prior @ np.linalg.solve(prior + noise, measured))
     assert covariance == pytest.approx(np.linalg.inv(np.linalg.inv(prior) + np.linalg.inv(noise)))
 
@@ -70,7 +65,7 @@ def test_one_error_is_named(cause: SetupCause, number: int, component: str, size
     """A single error selects its own cause, with its size."""
     errors = np.zeros(len(LAYOUT))
     errors[LAYOUT.of_station(number, component)[0]] = size
-    selection = Selection(information_of(errors, precise()), NOMINAL, CANDIDATES)
+    selection = CauseSelection(information_of(errors, precise()), NOMINAL, CANDIDATES)
     (found,) = selection.summarise(selection.search())
     assert found.hypothesis.key == (cause, number)
     assert found.estimate == pytest.approx([size], rel=0.05)
@@ -81,7 +76,7 @@ def test_nothing_is_named_within_the_nominal_uncertainty() -> None:
     """Errors as large as a correct set-up has them select nothing."""
     for seed in range(20):
         errors = np.random.default_rng(seed).multivariate_normal(np.zeros(len(LAYOUT)), NOMINAL)
-        selection = Selection(information_of(errors, precise()), NOMINAL, CANDIDATES)
+        selection = CauseSelection(information_of(errors, precise()), NOMINAL, CANDIDATES)
         assert not selection.search()
 
 
@@ -90,7 +85,7 @@ def test_a_pair_is_named() -> None:
     errors = np.zeros(len(LAYOUT))
     errors[LAYOUT.of_station(2, "rotation_z")[0]] = 5e-4
     errors[LAYOUT.of_prism(1)] = [0.008, 0.006, 0.0]
-    selection = Selection(information_of(errors, precise()), NOMINAL, CANDIDATES)
+    selection = CauseSelection(information_of(errors, precise()), NOMINAL, CANDIDATES)
     found = {each.hypothesis.key for each in selection.summarise(selection.search())}
     assert found == {(SetupCause.TURNED, 2), (SetupCause.PRISM, 1)}
 
@@ -102,7 +97,7 @@ def test_what_cannot_be_told_apart_is_listed() -> None:
     direction = np.zeros(len(LAYOUT))
     direction[latency], direction[constant] = 1.0, 2.0  # both move the same way
     matrix = np.outer(direction, direction) / 1e-4**2
-    selection = Selection(Information(matrix, matrix[:, latency] * 0.008), NOMINAL, CANDIDATES)
+    selection = CauseSelection(Information(matrix, matrix[:, latency] * 0.008), NOMINAL, CANDIDATES)
     (found,) = selection.summarise(selection.search())
     named = {found.hypothesis.cause, *(each.cause for each, _ in found.alternatives)}
     assert named == {SetupCause.LATENCY, SetupCause.RANGE_CONSTANT}

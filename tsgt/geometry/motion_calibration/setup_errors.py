@@ -1,9 +1,10 @@
 """Errors of a set-up as one vector, and what the measurements of a moving robot say about them. Sans-I/O.
 
-For three stations and prisms the vector has 60 components: of each station its frame, the drift of its frame from the start to
+Beside the parameters of a calibration from motion these errors contain drifts during the recording, and station 1 is treated as
+any other, since the trajectory moves with an error that all stations share: such directions carry no information. For three
+stations and prisms the vector has 60 components: of each station its frame, the drift of its frame from the start to
 the end of the recording, latency, vertical index, collimation, constant and scale of the range; of each prism its position.
-Station 1 is treated as any other, since the trajectory moves with an error that all stations share: such directions carry no
-information. Names are those of :class:`tsgt.model.SetupCovariance`.
+Names are those of :class:`tsgt.model.SetupCovariance`.
 """
 
 from __future__ import annotations
@@ -13,23 +14,27 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.errors import GeometryError
-from tsgt.geometry import exp_so3
-from tsgt.geometry.trajectory import STATE_DIM, initial_guess, knot_times, line_of_sight_axes, solve
+from tsgt.geometry.motion_calibration.information import Information
+from tsgt.geometry.motion_calibration.joint_system import eliminate_trajectory, segment_rows
+from tsgt.geometry.motion_calibration.setup_parameters import (
+    INSTRUMENT_ERRORS,
+    Setup,
+    by_displacements,
+    by_instrument_errors,
+)
+from tsgt.geometry.rigid import exp_so3, matvec, rotate
+from tsgt.geometry.trajectory import initial_guess, knot_times, solve
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
-    from tsgt.geometry import FloatArray
+    from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, Solution
     from tsgt.model import MotionPrior, SetupCovariance
 
 FRAME = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 DRIFT = tuple(f"drift_{axis}" for axis in FRAME)
-INSTRUMENT = ("latency", "vertical_index", "collimation", "prism_constant", "range_scale")
-STATION_COMPONENTS = (*FRAME, *DRIFT, *INSTRUMENT)
+STATION_COMPONENTS = (*FRAME, *DRIFT, "latency", *INSTRUMENT_ERRORS)
 
 NOMINAL = {
     **dict.fromkeys(FRAME[:3], 3e-3),
@@ -46,9 +51,6 @@ NOMINAL = {
 In m, rad and s."""
 
 NOMINAL_PRISM_M = 5e-4
-SEGMENT_S = 40.0
-MAX_GAP_S = 5.0
-MIN_MEASUREMENTS = 30
 MAX_SEGMENTS = 20  # Evenly spread ones represent a long recording
 
 
@@ -103,24 +105,20 @@ class SetupErrors:
 
     def corrected(self, observations: Observations, errors: FloatArray) -> Observations:
         """Return observations without these errors, (G,): frames and instruments in the points, latencies in the times."""
-        points, time_s = observations.points_m.copy(), observations.time_s.copy()
+        setup = replace(
+            Setup.of(observations),
+            instrument=np.stack([errors[self.of_station(n, *INSTRUMENT_ERRORS)] for n in self.stations]),
+        )
+        points, time_s = setup.corrected_points(observations).copy(), observations.time_s.copy()
         phase = drift_phase(observations.time_s)
         for row, number in enumerate(self.stations):
             own = np.flatnonzero(observations.station == row)
-            at = {name: errors[self.of_station(number, name)[0]] for name in STATION_COMPONENTS}
-            axes, distance_m = line_of_sight_axes(points[own])
-            along = at["prism_constant"] + at["range_scale"] * distance_m
-            shift = np.stack(
-                [along, at["collimation"] * distance_m, -at["vertical_index"] * distance_m], axis=1
-            )
-            in_station = points[own] + np.einsum("mji,mj->mi", axes, shift)
             rotation = observations.frames[row, :3, :3]
-            frame = np.array([at[name] for name in FRAME])
-            drift = np.array([at[name] for name in DRIFT])
+            frame, drift = errors[self.of_station(number, *FRAME)], errors[self.of_station(number, *DRIFT)]
             moved = frame + phase[own, None] * drift
-            turned = np.einsum("mij,mj->mi", exp_so3(moved[:, 3:]), in_station @ rotation.T)
+            turned = rotate(exp_so3(moved[:, 3:]), points[own] @ rotation.T)
             points[own] = (turned + moved[:, :3]) @ rotation
-            time_s[own] -= at["latency"]
+            time_s[own] -= errors[self.of_station(number, "latency")]
         prisms_m = errors[len(self) - 3 * len(self.prisms) :].reshape(-1, 3)
         changed = replace(observations, points_m=points, time_s=time_s, layout=observations.layout + prisms_m)
         return changed.select(np.argsort(time_s, kind="stable"))
@@ -130,28 +128,22 @@ class SetupErrors:
     ) -> FloatArray:
         """(M, 3, G) Jacobian of the residuals by the errors; ``phase``, (M,), of :func:`drift_phase`."""
         jacobian = np.zeros((len(observations), 3, len(self)))
-        distance_m = np.linalg.norm(observations.points_m, axis=1)
+        each = np.arange(3)
+        by_frame = by_displacements(linearised, observations.frames[observations.station, :3, 3])
+        by_latency = -matvec(linearised.by_point, linearised.velocity_mps)
+        by_instrument = by_instrument_errors(observations, linearised, Setup.of(observations))
         for row, number in enumerate(self.stations):
             own = np.flatnonzero(observations.station == row)
-            by_point = linearised.by_point[own]
-            lever_arm = linearised.point_m[own] - observations.frames[row, :3, 3]
-            by_rotation = np.cross(by_point, lever_arm[:, None, :])
-            by_frame = np.concatenate([-by_point, by_rotation], axis=2)
-            at = self.of_station(number, *FRAME)
-            jacobian[own, :, at[0] : at[0] + 6] = by_frame
-            at = self.of_station(number, *DRIFT)
-            jacobian[own, :, at[0] : at[0] + 6] = by_frame * phase[own, None, None]
-            latency, index, collimation, constant, scale = self.of_station(number, *INSTRUMENT)
-            jacobian[own, :, latency] = -np.einsum("mij,mj->mi", by_point, linearised.velocity_mps[own])
-            jacobian[own, 2, index] = distance_m[own]
-            jacobian[own, 1, collimation] = -distance_m[own]
-            jacobian[own, 0, constant] = -1.0
-            jacobian[own, 0, scale] = -distance_m[own]
+            jacobian[np.ix_(own, each, self.of_station(number, *FRAME))] = by_frame[own]
+            drifting = by_frame[own] * phase[own, None, None]
+            jacobian[np.ix_(own, each, self.of_station(number, *DRIFT))] = drifting
+            jacobian[own, :, self.of_station(number, "latency")[0]] = by_latency[own]
+            at = self.of_station(number, *INSTRUMENT_ERRORS)
+            jacobian[np.ix_(own, each, at)] = by_instrument[own]
         by_layout = linearised.by_point @ linearised.rotation
         for row, number in enumerate(self.prisms):
             own = np.flatnonzero(observations.prism == row)
-            at = self.of_prism(number)
-            jacobian[own, :, at[0] : at[0] + 3] = by_layout[own]
+            jacobian[np.ix_(own, each, self.of_prism(number))] = by_layout[own]
         return jacobian
 
 
@@ -162,17 +154,7 @@ def drift_phase(time_s: FloatArray) -> FloatArray:
     return phase
 
 
-class Information(NamedTuple):
-    """What measurements say about the errors, their trajectory eliminated: quadratic about zero errors."""
-
-    matrix: FloatArray  # (G, G) information
-    vector: FloatArray  # (G,) information times the most likely errors
-
-    def __add__(self, other: Information) -> Information:  # type: ignore[override]
-        return Information(self.matrix + other.matrix, self.vector + other.vector)
-
-
-class Linearisation(NamedTuple):
+class LinearisedSetup(NamedTuple):
     """Solved segments of a recording, corrected for some errors."""
 
     segments: list[Information]
@@ -201,7 +183,7 @@ def linearise_setup(
     errors: FloatArray,
     prior: MotionPrior,
     noise: FloatArray,
-) -> Linearisation:
+) -> LinearisedSetup:
     """Solve the trajectory of each segment, corrected for ``errors``, (G,), with the stated noise times ``noise``, (S, 3).
 
     Raises GeometryError: the measurements do not determine a trajectory.
@@ -210,12 +192,14 @@ def linearise_setup(
     changed = replace(changed, sigmas_m=changed.sigmas_m * noise[changed.station])
     phase = drift_phase(changed.time_s)
     information, parts = [], []
-    for rows in _segments(changed.time_s, changed.prism):
+    for rows in segment_rows(changed.time_s, changed.prism, max_segments=MAX_SEGMENTS):
         some = changed.select(rows)
         solution = solve(some, initial_guess(some, knot_times(some.time_s)), prior, reject_outliers=True)
         by_errors = layout.jacobian(some, solution.linearised, phase[rows])
-        part, redundancy = _eliminate(some, solution, by_errors)
-        information.append(Information(part.matrix, part.matrix @ errors + part.vector))
+        part = eliminate_trajectory(some, solution, by_errors)
+        matrix = 0.5 * (part.information + part.information.T)
+        information.append(Information(matrix, matrix @ errors - part.gradient))
+        redundancy = _redundancy(some, solution)
         speed = np.linalg.norm(solution.linearised.velocity_mps, axis=1)
         parts.append(
             (
@@ -228,14 +212,10 @@ def linearise_setup(
                 by_errors,
             )
         )
-    if not parts:
-        raise GeometryError(
-            f"too few measurements for a diagnosis: no {SEGMENT_S:.0f} s of them have {MIN_MEASUREMENTS}, of 3 prisms"
-        )
     rows, residuals_m, redundancy, weights, squared, speed, by_errors = (
         np.concatenate(each) for each in zip(*parts, strict=True)
     )
-    return Linearisation(
+    return LinearisedSetup(
         information,
         changed.select(rows),
         residuals_m,
@@ -247,29 +227,9 @@ def linearise_setup(
     )
 
 
-def _segments(time_s: FloatArray, prism: NDArray[np.intp]) -> Sequence[NDArray[np.intp]]:
-    count = max(1, round(float(time_s[-1] - time_s[0]) / SEGMENT_S))
-    edges = np.searchsorted(time_s, np.linspace(time_s[0], time_s[-1], count + 1)[1:-1])
-    gaps = np.flatnonzero(np.diff(time_s) > MAX_GAP_S) + 1
-    rows = np.split(np.arange(len(time_s)), np.unique(np.concatenate([edges, gaps])).astype(np.intp))
-    usable = [each for each in rows if len(each) >= MIN_MEASUREMENTS and len(np.unique(prism[each])) >= 3]
-    some = np.unique(np.linspace(0, len(usable) - 1, min(len(usable), MAX_SEGMENTS)).round().astype(np.intp))
-    return [usable[each] for each in some]
-
-
-def _eliminate(
-    observations: Observations, solution: Solution, by_errors: FloatArray
-) -> tuple[Information, FloatArray]:
-    """Eliminate the trajectory (Schur complement): information about the errors' change, and redundancies, (M, 3)."""
+def _redundancy(observations: Observations, solution: Solution) -> FloatArray:
+    """(M, 3) share of each measured component that the trajectory does not follow."""
     linearised = solution.linearised
-    whitening = np.linalg.inv(np.linalg.cholesky(linearised.covariance(observations)))
-    weighted = whitening * np.sqrt(solution.weights)[:, None, None]
-    residuals = np.einsum("mij,mj->mi", weighted, linearised.residuals_m)
-    by_state, by_error = weighted @ linearised.jacobian, weighted @ by_errors
-    cross = np.zeros((len(solution.knots), STATE_DIM, by_error.shape[2]))
-    np.add.at(cross, solution.knot_index, np.swapaxes(by_state, 1, 2) @ by_error)
-    flat = by_error.reshape(-1, by_error.shape[2])
-    matrix = flat.T @ flat - np.tensordot(cross, solution.factor.solve(cross), axes=((0, 1), (0, 1)))
     covariance, _ = solution.factor.marginals()
     own = np.einsum(
         "mij,mjk,mik->mi",
@@ -279,5 +239,5 @@ def _eliminate(
         optimize=True,
     )
     noise = np.diagonal(linearised.covariance(observations), axis1=1, axis2=2)
-    redundancy = 1.0 - solution.weights[:, None] * own / noise
-    return Information(0.5 * (matrix + matrix.T), -flat.T @ residuals.ravel()), redundancy
+    redundancy: FloatArray = 1.0 - solution.weights[:, None] * own / noise
+    return redundancy

@@ -1,8 +1,9 @@
 """Which errors of the set-up the measurements show: Bayesian model selection over few, named causes. Sans-I/O.
 
-Each hypothesis gives some errors a wide prior in addition to the nominal one of all. The evidence of a set of hypotheses follows in
-closed form from the quadratic information (R. E. Kass and A. E. Raftery, Bayes factors, JASA 90, 1995), so that all of them
-cost nothing compared with the trajectory. Hypotheses are added, exchanged and removed one at a time while the evidence grows.
+Each hypothesis gives some errors a wide prior in addition to the nominal one of all. Hypotheses are added, exchanged and
+removed one at a time while the evidence grows. The refinement (:mod:`.refinement`) asks another question of the same
+information: which directions to free so that the set-up fits. It takes no drifts, which a set-up cannot have, and wider priors,
+so that gross errors are corrected in full; here priors are of the size of faults that have a name, which tells them apart.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.diagnosis.setup_errors import DRIFT, FRAME
+from tsgt.geometry.motion_calibration.setup_errors import DRIFT, FRAME
+from tsgt.geometry.motion_calibration.setup_prior import factor_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.analysis.diagnosis.setup_errors import Information, SetupErrors
-    from tsgt.geometry import FloatArray
+    from tsgt.geometry.motion_calibration.information import Information
+    from tsgt.geometry.motion_calibration.setup_errors import SetupErrors
+    from tsgt.geometry.rigid import FloatArray
 
 EVIDENCE_THRESHOLD = (
     7.0  # Log Bayes factor beyond which a cause counts: 1100 to 1, as about 40 causes are tested
@@ -68,7 +71,7 @@ _PRISM_M = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Hypothesis:
+class CauseHypothesis:
     """A possible cause: kind, number of the station or prism, and the errors that it frees, with their wide sigmas."""
 
     cause: SetupCause
@@ -94,68 +97,57 @@ class SelectedCause:
     alternatives : Others that explain the measurements nearly as well in its place, with the log Bayes factor against them.
     """
 
-    hypothesis: Hypothesis
+    hypothesis: CauseHypothesis
     log_bayes_factor: float
     estimate: FloatArray
     covariance: FloatArray
-    alternatives: tuple[tuple[Hypothesis, float], ...]
+    alternatives: tuple[tuple[CauseHypothesis, float], ...]
 
 
-def hypotheses(layout: SetupErrors) -> list[Hypothesis]:
+def cause_hypotheses(layout: SetupErrors) -> list[CauseHypothesis]:
     """All hypotheses about stations and prisms."""
     found = [
-        Hypothesis(cause, number, tuple(layout.of_station(number, *names).tolist()), sigmas, log_odds)
+        CauseHypothesis(cause, number, tuple(layout.of_station(number, *names).tolist()), sigmas, log_odds)
         for number in layout.stations
         for cause, (names, sigmas, log_odds) in _OF_STATION.items()
     ]
     found += [
-        Hypothesis(SetupCause.PRISM, number, tuple(layout.of_prism(number).tolist()), (_PRISM_M,) * 3, 0.0)
+        CauseHypothesis(
+            SetupCause.PRISM, number, tuple(layout.of_prism(number).tolist()), (_PRISM_M,) * 3, 0.0
+        )
         for number in layout.prisms
     ]
     return found
 
 
-def log_evidence(information: Information, covariance: FloatArray) -> float:
-    """Log evidence of errors with this covariance, (G, G), against no errors at all."""
-    system = np.eye(len(covariance)) + information.matrix @ covariance
-    solved = np.linalg.solve(system, information.vector)
-    _, log_determinant = np.linalg.slogdet(system)
-    return 0.5 * float(information.vector @ covariance @ solved - log_determinant)
-
-
-def posterior(information: Information, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean, (G,), and covariance, (G, G), of errors with this prior covariance."""
-    system = np.eye(len(covariance)) + information.matrix @ covariance
-    found = covariance @ np.linalg.inv(system)
-    return found @ information.vector, 0.5 * (found + found.T)
-
-
-class Selection:
+class CauseSelection:
     """Evidence of sets of hypotheses, each computed once."""
 
     def __init__(
-        self, information: Information, nominal: FloatArray, candidates: Sequence[Hypothesis]
+        self, information: Information, nominal: FloatArray, candidates: Sequence[CauseHypothesis]
     ) -> None:
         self.information = information
-        self.nominal = nominal
+        self._nominal = factor_of(nominal)
         self.candidates = tuple(candidates)
-        self._known: dict[frozenset[Hypothesis], float] = {}
+        self._known: dict[frozenset[CauseHypothesis], float] = {}
 
-    def prior(self, chosen: frozenset[Hypothesis]) -> FloatArray:
-        """Prior covariance of the errors, (G, G), with these causes."""
-        covariance = self.nominal.copy()
-        for each in chosen:
-            covariance[each.rows, each.rows] += np.square(each.sigmas)
-        return covariance
+    def prior(self, chosen: frozenset[CauseHypothesis]) -> FloatArray:
+        """(G, r) factor of the prior covariance of the errors with these causes."""
+        return np.concatenate([self._nominal, *(self._factor(each) for each in chosen)], axis=1)
 
-    def evidence(self, chosen: frozenset[Hypothesis]) -> float:
+    def _factor(self, hypothesis: CauseHypothesis) -> FloatArray:
+        factor = np.zeros((len(self._nominal), len(hypothesis.rows)))
+        factor[hypothesis.rows, range(len(hypothesis.rows))] = hypothesis.sigmas
+        return factor
+
+    def evidence(self, chosen: frozenset[CauseHypothesis]) -> float:
         """Log evidence of a set of causes, with its prior odds."""
         if chosen not in self._known:
             odds = sum(each.log_odds - EVIDENCE_THRESHOLD for each in chosen)
-            self._known[chosen] = log_evidence(self.information, self.prior(chosen)) + odds
+            self._known[chosen] = self.information.evidence(self.prior(chosen)) + odds
         return self._known[chosen]
 
-    def search(self, start: frozenset[Hypothesis] = frozenset()) -> frozenset[Hypothesis]:
+    def search(self, start: frozenset[CauseHypothesis] = frozenset()) -> frozenset[CauseHypothesis]:
         """Add, exchange or remove one cause at a time while the evidence grows."""
         chosen = start
         while True:
@@ -164,7 +156,7 @@ class Selection:
                 return chosen
             chosen = best
 
-    def _neighbours(self, chosen: frozenset[Hypothesis]) -> list[frozenset[Hypothesis]]:
+    def _neighbours(self, chosen: frozenset[CauseHypothesis]) -> list[frozenset[CauseHypothesis]]:
         others = [each for each in self.candidates if each not in chosen]
         neighbours = [chosen - {each} for each in chosen]
         neighbours += [chosen - {old} | {new} for old in chosen for new in others]
@@ -174,7 +166,7 @@ class Selection:
             neighbours += [chosen | {each} for each in others]
         return neighbours or [chosen]
 
-    def single(self) -> dict[Hypothesis, float]:
+    def single(self) -> dict[CauseHypothesis, float]:
         """Log Bayes factor of each cause alone against none."""
         none = self.evidence(frozenset())
         return {
@@ -182,9 +174,9 @@ class Selection:
             for each in self.candidates
         }
 
-    def summarise(self, chosen: frozenset[Hypothesis]) -> list[SelectedCause]:
+    def summarise(self, chosen: frozenset[CauseHypothesis]) -> list[SelectedCause]:
         """Estimates and alternatives of the chosen causes, the most evident first."""
-        mean, covariance = posterior(self.information, self.prior(chosen))
+        mean, covariance = self.information.posterior(self.prior(chosen))
         found = []
         for each in chosen:
             rows = np.array(each.rows, np.intp)

@@ -10,7 +10,7 @@ from tsgt.estimation.inertial import inertial_samples
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
-from tsgt.estimation.observations import build_observations, instrument_time_sigma_s
+from tsgt.estimation.observations import build_observations, centroid_m, instrument_time_sigma_s
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.pose_quality import sigma_limits_of
@@ -57,6 +57,7 @@ __all__ = [
     "build_observations",
     "build_tracks",
     "centroid_at_point",
+    "centroid_m",
     "centroid_point",
     "has_plausible_time",
     "inertial_samples",

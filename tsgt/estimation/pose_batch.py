@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum, IntFlag
@@ -46,7 +45,6 @@ class Degradation(IntFlag):
     RESIDUAL = 16
 
 
-@functools.cache
 def degradation_words(value: int) -> tuple[stream_records.Degradation, ...]:
     """Return the words on the stream of a value of :class:`Degradation`."""
     return tuple(
@@ -162,6 +160,7 @@ class PoseBatch:
             return
         computed = np.isfinite(self.position_m[:, 0])
         reasons, kinds = [reason.word for reason in Reason], [kind.word for kind in Kind]
+        degradations = [degradation_words(value) for value in range(2 * max(Degradation))]
         # One conversion to Python numbers per array, not per element.
         rows = zip(
             self.stamp_ns.tolist(),
@@ -202,7 +201,7 @@ class PoseBatch:
                 valid=reason == Reason.VALID,
                 reason=reasons[reason],
                 quality="invalid" if reason else "degraded" if degraded else "good",
-                degraded_by=degradation_words(degraded),
+                degraded_by=degradations[degraded],
                 residual_m=None if math.isnan(residual) else residual,
                 stations=shares,
             )

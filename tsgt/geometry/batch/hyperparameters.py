@@ -32,7 +32,8 @@ from tsgt.geometry.batch.process_moments import (
     expected_moments,
     expected_squared_distances,
 )
-from tsgt.geometry.rest import find_rest, rest_factors, steps_in_rest
+from tsgt.geometry.batch.rest import rest_factors, steps_in_rest
+from tsgt.geometry.batch.rest_detection import find_rest
 from tsgt.geometry.trajectory.gauss_newton import (
     REJECTION_THRESHOLD,
     knot_times,

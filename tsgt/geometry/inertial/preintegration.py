@@ -9,13 +9,15 @@ the product of the rotations. docs/explanation/imu.md derives the sums.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from tsgt.geometry.rigid import IDENTITY, FloatArray, cross, exp_and_right_jacobian, exp_so3, matvec, skew
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from tsgt.geometry.inertial.samples import InertialSamples
@@ -154,34 +156,78 @@ def preintegrate(
     Samples are cut at the ends of an interval: rate and force are constant within each. Biases, (K, 3) or (3,), are
     subtracted.
     """
-    count = len(start_s)
-    biases = np.concatenate(
+    biases = _biases(len(start_s), gyro_bias, accelerometer_bias)
+    parts = [_integrate(samples, part) for part in _parts(samples, start_s, end_s, biases)]
+    return parts[0] if len(parts) == 1 else concatenate_preintegrated(parts)
+
+
+def matrix_jacobians(
+    samples: ContiguousSamples,
+    start_s: FloatArray,
+    end_s: FloatArray,
+    gyro_bias: FloatArray,
+    accelerometer_bias: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of the preintegrated errors by errors of scale and misalignment, (K, 9, 3, 3) each; arguments as above.
+
+    The first is that by E, (3, 3), if all angular rates are multiplied by ``I + E``, the second the same for specific forces.
+    """
+    biases = _biases(len(start_s), gyro_bias, accelerometer_bias)
+    parts = [_by_matrices(samples, part) for part in _parts(samples, start_s, end_s, biases)]
+    return np.concatenate([each[0] for each in parts]), np.concatenate([each[1] for each in parts])
+
+
+def _biases(count: int, gyro_bias: FloatArray, accelerometer_bias: FloatArray) -> FloatArray:
+    return np.concatenate(
         [np.broadcast_to(gyro_bias, (count, 3)), np.broadcast_to(accelerometer_bias, (count, 3))], axis=1
     )
+
+
+class _Part(NamedTuple):
+    """Some intervals, and at most S samples of each: ``size`` from ``first`` on."""
+
+    start_s: FloatArray
+    end_s: FloatArray
+    first: NDArray[np.intp]
+    size: NDArray[np.intp]
+    biases: FloatArray  # (K, 6)
+
+
+def _parts(
+    samples: ContiguousSamples, start_s: FloatArray, end_s: FloatArray, biases: FloatArray
+) -> Iterator[_Part]:
+    """Divide intervals into parts of limited size."""
+    count = len(start_s)
     first = np.clip(np.searchsorted(samples.bounds_s, start_s, side="right") - 1, 0, len(samples) - 1)
     stop = np.clip(np.searchsorted(samples.bounds_s, end_s, side="left"), first + 1, len(samples))
     size = stop - first
-    parts = []
     begin = 0
     while begin < count:
         # Intervals of one chunk are padded to the longest.
         longest = np.maximum.accumulate(size[begin : begin + _PARTS_PER_CHUNK])
         fitting = int(np.count_nonzero(longest * np.arange(1, len(longest) + 1) <= _PARTS_PER_CHUNK))
         rows = slice(begin, begin + max(fitting, 1))
-        parts.append(_integrate(samples, start_s[rows], end_s[rows], first[rows], size[rows], biases[rows]))
+        yield _Part(start_s[rows], end_s[rows], first[rows], size[rows], biases[rows])
         begin = rows.stop
-    return parts[0] if len(parts) == 1 else concatenate_preintegrated(parts)
 
 
-def _integrate(
-    samples: ContiguousSamples,
-    start_s: FloatArray,
-    end_s: FloatArray,
-    first: NDArray[np.intp],
-    size: NDArray[np.intp],
-    biases: FloatArray,
-) -> Preintegrated:
-    """Preintegrate intervals of at most S samples, ``size`` from ``first`` on; padding has zero duration."""
+class _Integrals(NamedTuple):
+    """Of K intervals and S samples of each."""
+
+    rows: NDArray[np.intp]  # (K, S) of the samples
+    dt_s: FloatArray  # (K, S) zero for padding
+    remaining_s: FloatArray  # (K, S) from the middle of the sample to the end of the interval
+    angle: FloatArray  # (K, S, 3)
+    force: FloatArray  # (K, S, 3)
+    integral: FloatArray  # (K, S, 3, 3) of the rotation to the axes at the start over each sample
+    end_rotation: FloatArray  # (K, 3, 3)
+    # (K, S, 6) change of velocity and of position by all later samples, and half of the own
+    lever: FloatArray
+    total: FloatArray  # (K, 6) change of velocity and of position by all samples
+
+
+def _integrals(samples: ContiguousSamples, part: _Part) -> _Integrals:
+    start_s, end_s, first, size, biases = part
     count, longest = len(size), int(size.max())
     step = np.arange(longest)
     index = np.minimum(first[:, None] + step, (first + size - 1)[:, None])
@@ -198,19 +244,26 @@ def _integrate(
     rotation[:, 0] = IDENTITY
     for i in range(longest):
         np.matmul(rotation[:, i], delta_R[:, i], out=rotation[:, i + 1])
-    end_rotation_T = np.swapaxes(rotation[:, -1], 1, 2)
     # Integral of the rotation over each sample, from the axes during it to those at the start: the transpose of the right
     # Jacobian is the left one. It takes the force to an increment of velocity, and a bias to an error of rotation.
     integral = rotation[:, :-1] @ np.swapaxes(J_r, 2, 3)
     integral *= dt_s[..., None, None]
     increment = matvec(integral, force)
-    # The increment's mean time is a little off the middle of the sample, for it turns meanwhile.
-    sculling = matvec(integral, cross(angle, force)) * (dt_s / 12)[..., None]
     moments = increment * remaining_s[..., None]
     # An error of rotation in sample i, in the axes at the start, acts on all later increments, and half on its own.
     lever = np.concatenate([increment, moments], axis=2)
     total = lever.sum(axis=1)
     lever = total[:, None] - np.cumsum(lever, axis=1) + 0.5 * lever
+    return _Integrals(index, dt_s, remaining_s, angle, force, integral, rotation[:, -1].copy(), lever, total)
+
+
+def _integrate(samples: ContiguousSamples, part: _Part) -> Preintegrated:
+    """Preintegrate intervals."""
+    index, dt_s, remaining_s, angle, force, integral, end_rotation, lever, total = _integrals(samples, part)
+    count, longest = dt_s.shape
+    end_rotation_T = np.swapaxes(end_rotation, 1, 2)
+    # The increment's mean time is a little off the middle of the sample, for it turns meanwhile.
+    sculling = matvec(integral, cross(angle, force)) * (dt_s / 12)[..., None]
 
     weights = np.empty((count, longest, 8))
     weights[..., 0], weights[..., 1], weights[..., 2:] = 1.0, remaining_s, lever
@@ -223,17 +276,48 @@ def _integrate(
     gyro_variance = samples.gyro_density[index] ** 2 * dt_s
     force_variance = samples.accelerometer_density[index] ** 2 * dt_s
     return Preintegrated(
-        end_s - start_s,
+        part.end_s - part.start_s,
         total[:, 3:] - sculling.sum(axis=1),
-        rotation[:, -1].copy(),
+        end_rotation,
         total[:, :3].copy(),
         _covariance(lever, end_rotation_T, gyro_variance, force_variance, dt_s, remaining_s),
         by_gyro_bias,
         by_accelerometer_bias,
-        biases[:, :3],
-        biases[:, 3:],
+        part.biases[:, :3],
+        part.biases[:, 3:],
         (dt_s * samples.missing[index]).sum(axis=1),
     )
+
+
+def _by_matrices(samples: ContiguousSamples, part: _Part) -> tuple[FloatArray, FloatArray]:
+    """Jacobians of :func:`matrix_jacobians`: a bias of each sample that is proportional to what it measures."""
+    found = _integrals(samples, part)
+    count, longest = found.dt_s.shape
+    rate, force = samples.angular_rate_radps[found.rows], samples.specific_force_mps2[found.rows]
+    of_gyro = np.concatenate([np.ones((count, longest, 1)), found.lever], axis=2)
+    of_accelerometer = np.stack([np.ones((count, longest)), found.remaining_s], axis=2)
+    weights = np.concatenate(
+        [
+            (of_gyro[..., None] * rate[:, :, None]).reshape(count, longest, 21),
+            (of_accelerometer[..., None] * force[:, :, None]).reshape(count, longest, 6),
+        ],
+        axis=2,
+    )
+    sums = np.swapaxes(weights, 1, 2) @ found.integral.reshape(count, longest, 9)
+    # (K, weight, component of the measured vector, 3, 3)
+    by_rate, by_force = (
+        sums[:, :21].reshape(count, 7, 3, 3, 3),
+        sums[:, 21:].reshape(count, 2, 3, 3, 3),
+    )
+    by_gyro, by_accelerometer = np.empty((count, 9, 3, 3)), np.zeros((count, 9, 3, 3))
+    end_rotation_T = np.swapaxes(found.end_rotation, 1, 2)
+    for column in range(3):
+        by_gyro[:, 3:6, :, column] = end_rotation_T @ by_rate[:, 0, column]
+        by_gyro[:, 0:3, :, column] = -_sum_of_crosses(by_rate[:, 4:7, column])
+        by_gyro[:, 6:9, :, column] = -_sum_of_crosses(by_rate[:, 1:4, column])
+        by_accelerometer[:, 0:3, :, column] = by_force[:, 1, column]
+        by_accelerometer[:, 6:9, :, column] = by_force[:, 0, column]
+    return by_gyro, by_accelerometer
 
 
 def _sum_of_crosses(products: FloatArray) -> FloatArray:

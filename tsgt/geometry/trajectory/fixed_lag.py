@@ -7,6 +7,7 @@ uncertainty: a large residual may also be a manoeuvre. See docs/explanation/cont
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,11 +33,10 @@ from tsgt.geometry.trajectory.gauss_newton import (
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
 from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
-from tsgt.geometry.trajectory.measurement_factors import Observations, merge_observations, time_order
+from tsgt.geometry.trajectory.measurement_factors import Observations
 from tsgt.geometry.trajectory.prediction_errors import PredictionErrorMonitor
 from tsgt.geometry.trajectory.propagation import Propagator, acceleration_response
 from tsgt.geometry.trajectory.query import Trajectory
-from tsgt.geometry.trajectory.rest_window import RestWindow
 from tsgt.geometry.trajectory.sensitivity import WindowSensitivity, common_covariance
 from tsgt.geometry.trajectory.states import STATE_DIM, ProcessFactors, States, concatenate_states
 
@@ -106,8 +106,6 @@ class FixedLagSmoother:
         self._reliable_from_s = np.inf
         self._solved: tuple[States, BlockCholesky] | None = None
         self._trajectory: Trajectory | None = None
-        self._rest = RestWindow(prior)
-        self._smoothed: Trajectory | None = None
         self._propagator: Propagator | None = None
         self._newest_nis = 0.0
         self._prediction_errors = PredictionErrorMonitor()
@@ -159,10 +157,7 @@ class FixedLagSmoother:
 
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
-        held = self.observations
-        self.observations = new if held is None else merge_observations(held, new)
-        self._rest.add(new)
-        self._smoothed = None
+        held, self.observations = self.observations, _merge(self.observations, new)
         try:
             if not self._converged or held is None or not self._update_tracked(held, new):
                 self._initialise(self.observations)
@@ -174,7 +169,6 @@ class FixedLagSmoother:
     def marginalise_before(self, before_s: float) -> None:
         """Marginalise the states before a time; states from then on can still be queried."""
         self._monitor.discard_before(before_s)
-        self._smoothed = None
         if self.observations is None:
             return
         if self._converged:
@@ -264,21 +258,6 @@ class FixedLagSmoother:
             )
         return self._trajectory
 
-    def smoothed_trajectory(self) -> Trajectory:
-        """Return the trajectory for states between measurements, with rest as far as the window shows it."""
-        if self._smoothed is None:
-            self._smoothed = self._with_rest() or self.trajectory()
-        return self._smoothed
-
-    def _with_rest(self) -> Trajectory | None:
-        if not self._converged:
-            return None
-        observations, knots, _, anchor = self._window
-        try:
-            return self._rest.solve(observations, knots, anchor, self._common)
-        except GeometryError:  # by rounding alone
-            return None
-
     def common_at(self, time_s: float, *, dim: int = STATE_DIM) -> FloatArray | None:
         """Return the (1, dim, dim) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""
         if self._common is None:
@@ -325,7 +304,7 @@ class FixedLagSmoother:
         if knots is not self._knots:
             process = ProcessFactors.of(knots.time_s, self._prior)
         knot_index = nearest_knots(knots.time_s, observations.time_s)
-        is_new = time_order(held, new) >= len(held)
+        is_new = _time_order(held, new) >= len(held)
         system = assemble(
             observations, knot_index, knots, process, anchor, active=~is_new, rejectable=~is_new
         )
@@ -465,4 +444,21 @@ def _propagate(start: States, time_s: float, prior: MotionPrior) -> States:
         start.angular_velocity + start.angular_acceleration * angular[1],
         start.acceleration * linear[2],
         start.angular_acceleration * angular[2],
+    )
+
+
+def _time_order(held: Observations, new: Observations) -> NDArray[np.intp]:
+    """Sorting index of both, concatenated, by time, then prism, then station."""
+    keys = [(getattr(held, name), getattr(new, name)) for name in ("station", "prism", "time_s")]
+    return np.lexsort([np.concatenate(pair) for pair in keys])
+
+
+def _merge(held: Observations | None, new: Observations) -> Observations:
+    """Merge measurements in the order of time."""
+    if held is None:
+        return new
+    names = [field.name for field in fields(Observations) if field.name not in ("frames", "layout")]
+    order = _time_order(held, new)
+    return replace(
+        held, **{name: np.concatenate([getattr(held, name), getattr(new, name)])[order] for name in names}
     )

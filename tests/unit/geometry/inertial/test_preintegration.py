@@ -16,7 +16,11 @@ from tsgt.geometry.inertial import (
     contiguous,
     preintegrate,
 )
-from tsgt.geometry.inertial.preintegration import GAP_ANGULAR_RATE_SIGMA_RADPS, GAP_SPECIFIC_FORCE_SIGMA_MPS2
+from tsgt.geometry.inertial.preintegration import (
+    GAP_ANGULAR_RATE_SIGMA_RADPS,
+    GAP_SPECIFIC_FORCE_SIGMA_MPS2,
+    matrix_jacobians,
+)
 from tsgt.model import ImuNoise
 
 NOISE = ImuNoise(
@@ -258,3 +262,27 @@ def test_rate_and_force_at_instants() -> None:
     rate, force = contiguous(samples, NOISE).at(np.array([9.0, 10.0025, 10.005, 20.0]))
     np.testing.assert_allclose(rate[[0, 1, 3]], samples.angular_rate_radps[[0, 0, 9]])
     np.testing.assert_allclose(force[2], samples.specific_force_mps2[:2].mean(axis=0))
+
+
+def test_jacobians_by_matrices_equal_differences() -> None:
+    """Rates or forces that are all multiplied by a matrix change the motion as the Jacobians say."""
+    samples = contiguous(shaken(), NOISE)
+    edges_s = np.array([10.0021, 10.1, 10.21])
+    gyro, bias = np.array([0.01, -0.02, 0.03]), np.array([0.1, -0.2, 0.05])
+    jacobians = matrix_jacobians(samples, edges_s[:-1], edges_s[1:], gyro, bias)
+    step = 1e-5
+    for name, jacobian in zip(("angular_rate_radps", "specific_force_mps2"), jacobians, strict=True):
+        for row, column in np.ndindex(3, 3):
+            matrix = np.zeros((3, 3))
+            matrix[row, column] = step
+            after, before = (
+                over(
+                    replace(samples, **{name: getattr(samples, name) @ (np.eye(3) + sign * matrix).T}),
+                    *edges_s,
+                    gyro=gyro,
+                    force=bias,
+                )
+                for sign in (1, -1)
+            )
+            expected = error(after, before) / (2 * step)
+            np.testing.assert_allclose(jacobian[:, :, row, column], expected, atol=2e-3)

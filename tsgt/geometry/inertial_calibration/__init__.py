@@ -1,0 +1,21 @@
+"""Calibration of an IMU's mounting, latency and gyro matrix from motion, and the check of a configured one. Sans-I/O.
+
+In: polar measurements of the prisms, raw samples. Out: the set-up with its covariance, what the motion left uncertain, and the
+causes of a set-up that contradicts the data. docs/explanation/imu.md derives the equations.
+"""
+
+from tsgt.geometry.inertial_calibration.alignment import Alignment, align, series_of_samples, series_of_states
+from tsgt.geometry.inertial_calibration.calibration import ImuCalibration, calibrate_imu
+from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, symmetric_gauge
+
+__all__ = [
+    "Alignment",
+    "ImuCalibration",
+    "ImuSetup",
+    "SetupPrior",
+    "align",
+    "calibrate_imu",
+    "series_of_samples",
+    "series_of_states",
+    "symmetric_gauge",
+]

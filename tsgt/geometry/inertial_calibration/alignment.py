@@ -1,0 +1,186 @@
+"""First guess of an IMU's mounting and latency: its rates and forces against those of the stations' trajectory. Sans-I/O.
+
+At a latency, the rotation that takes the IMU's rates to the robot's best has a closed form (G. Wahba, SIAM Review 7, 1965), and
+so has the remaining sum of squares, which is least at the right latency. Both are blind to a bias, whatever the mounting. A
+robot that turns about one axis only leaves the rotation about this axis open; the specific forces determine it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import correlate
+
+from tsgt.errors import GeometryError
+from tsgt.geometry.rigid import matvec
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.inertial import Gravity, InertialSamples
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory import States
+
+GRID_S = 0.02
+SMOOTHING_S = 0.4  # Of rates and forces of both sides: what the stations can follow
+MAX_LATENCY_S = 10.0
+RATE_SIGMA_RADPS = 0.02
+FORCE_SIGMA_MPS2 = (
+    0.5  # Of the difference between the IMU and the stations, smoothed; includes the lever arm's
+)
+MIN_TURNING_RADPS = 0.03  # rms about the mean
+MIN_CORRELATION = 0.5
+MIN_OVERLAP_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Mounting and latency of an IMU by rates and forces alone: to degrees and hundredths of a second."""
+
+    rotation: FloatArray  # (3, 3) ``R_robot_imu``
+    latency_s: float
+    gyro_bias: FloatArray  # (3,) in the axes of the IMU
+    correlation: float  # Of the angular rates, 0 to 1, at that latency
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Angular rates and specific forces on a grid, smoothed, (N, 3) each; NaN-free, ``known`` where they hold."""
+
+    start_s: float
+    rate: FloatArray
+    force: FloatArray
+    known: NDArray[np.bool_]
+
+
+def series_of_states(states: States, gravity: Gravity) -> Series:
+    """Rates and forces in the axes of the robot from the states of a trajectory, on a grid."""
+    start_s = float(states.time_s[0])
+    grid_s = start_s + np.arange(int((states.time_s[-1] - start_s) / GRID_S) + 1, dtype=np.float64) * GRID_S
+    to_robot = np.swapaxes(states.rotation, 1, 2)
+    force = matvec(to_robot, states.acceleration - gravity.vector())
+    later = np.clip(np.searchsorted(states.time_s, grid_s), 1, len(states) - 1)
+    known = states.time_s[later] - states.time_s[later - 1] < 2 * SMOOTHING_S
+    return _smoothed(start_s, grid_s, states.time_s, states.angular_velocity, force, known)
+
+
+def series_of_samples(samples: InertialSamples) -> Series:
+    """Rates and forces in the axes of the IMU on a grid of its stamps."""
+    start_s = float(samples.end_s[0])
+    grid_s = start_s + np.arange(int((samples.end_s[-1] - start_s) / GRID_S) + 1, dtype=np.float64) * GRID_S
+    middle_s = samples.end_s - 0.5 * samples.duration_s
+    # Integrals, so that shaking between the points of the grid does not count.
+    rate, force = (
+        _mean_over_grid(grid_s, middle_s, samples.duration_s, values)
+        for values in (samples.angular_rate_radps, samples.specific_force_mps2)
+    )
+    later = np.clip(np.searchsorted(samples.end_s, grid_s), 1, len(samples) - 1)
+    known = samples.end_s[later] - samples.end_s[later - 1] < SMOOTHING_S
+    return _smoothed(start_s, grid_s, grid_s, rate, force, known)
+
+
+def align(robot: Series, imu: Series, *, max_latency_s: float = MAX_LATENCY_S) -> Alignment:
+    """Find mounting and latency. Raises GeometryError: the robot hardly turns, or no latency explains the rates."""
+    turning = float(np.sqrt(np.var(robot.rate[robot.known], axis=0).sum()))
+    if turning < MIN_TURNING_RADPS:
+        raise GeometryError(
+            f"the robot hardly turns (rms {np.degrees(turning):.1f} deg/s): drive curves, slopes and bumps"
+        )
+    lags, scores = _rate_scores(robot, imu, max_latency_s)
+    best = int(np.argmax(scores))
+    correlation = float(scores[best])
+    if correlation < MIN_CORRELATION:
+        raise GeometryError(
+            f"the angular rates of the IMU are not those of the robot at any latency within {max_latency_s:g} s "
+            f"(correlation {correlation:.2f}): another recording's IMU, or damaged samples"
+        )
+    latency_s = imu.start_s - robot.start_s + float(lags[best]) * GRID_S
+    if 0 < best < len(scores) - 1:
+        before, at, after = scores[best - 1 : best + 2]
+        curvature = before - 2 * at + after
+        if curvature < 0:
+            latency_s += 0.5 * GRID_S * float((before - after) / curvature)
+    ours, theirs = _overlap(robot, imu, int(lags[best]))
+    w, g = robot.rate[ours], imu.rate[theirs]
+    forces = robot.force[ours].T @ imu.force[theirs] / FORCE_SIGMA_MPS2**2
+    rates = (w - w.mean(axis=0)).T @ (g - g.mean(axis=0)) / RATE_SIGMA_RADPS**2
+    rotation = nearest_rotation(rates + forces)
+    return Alignment(rotation, latency_s, np.asarray((g - w @ rotation).mean(axis=0)), correlation)
+
+
+def nearest_rotation(products: FloatArray) -> FloatArray:
+    """Rotation R, (3, 3), that maximises ``trace(R^T products)``: it aligns ``b`` to ``a`` if products are sums of ``a b^T``."""
+    left, _, right = np.linalg.svd(products)
+    rotation: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return rotation
+
+
+def _rate_scores(robot: Series, imu: Series, max_latency_s: float) -> tuple[NDArray[np.intp], FloatArray]:
+    """Shifts of the IMU's grid against the robot's, in steps, and the correlation of the rates, aligned, at each."""
+    lags = np.arange(-len(robot.rate) + 1, len(imu.rate))
+    known, theirs = robot.known.astype(np.float64), imu.known.astype(np.float64)
+    a, b = robot.rate * known[:, None], imu.rate * theirs[:, None]
+
+    def correlated(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(correlate(y, x, mode="full", method="fft"))
+
+    count = np.maximum(correlated(known, theirs), 0.5)
+    sum_a = np.stack([correlated(a[:, i], theirs) for i in range(3)], axis=1)
+    sum_b = np.stack([correlated(known, b[:, i]) for i in range(3)], axis=1)
+    products = np.stack(
+        [np.stack([correlated(a[:, i], b[:, j]) for j in range(3)], axis=1) for i in range(3)], axis=1
+    )
+    products -= sum_a[:, :, None] * sum_b[:, None, :] / count[:, None, None]
+    square_a = correlated((a**2).sum(axis=1), theirs) - (sum_a**2).sum(axis=1) / count
+    square_b = correlated(known, (b**2).sum(axis=1)) - (sum_b**2).sum(axis=1) / count
+    latency_s = imu.start_s - robot.start_s + lags * GRID_S
+    allowed = (np.abs(latency_s) <= max_latency_s) & (count * GRID_S >= MIN_OVERLAP_S)
+    if not allowed.any():
+        raise GeometryError(
+            f"samples of the IMU and measurements have less than {MIN_OVERLAP_S:g} s in common"
+        )
+    lags, products = lags[allowed], products[allowed]
+    singular = np.linalg.svd(products, compute_uv=False)
+    aligned = singular.sum(axis=1) - 2 * singular[:, 2] * (np.linalg.det(products) < 0)
+    energy = np.sqrt(np.maximum(square_a[allowed] * square_b[allowed], 1e-12))
+    return lags, aligned / energy
+
+
+def _overlap(robot: Series, imu: Series, lag: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of both series at a shift where both are known."""
+    ours = np.arange(max(0, -lag), min(len(robot.rate), len(imu.rate) - lag))
+    ours = ours[robot.known[ours] & imu.known[ours + lag]]
+    return ours, ours + lag
+
+
+def _mean_over_grid(
+    grid_s: FloatArray, middle_s: FloatArray, duration_s: FloatArray, values: FloatArray
+) -> FloatArray:
+    """Mean of samples about each point of the grid, (N, 3)."""
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(values * duration_s[:, None], axis=0)])
+    time = np.concatenate([[0.0], np.cumsum(duration_s)])
+    edges = np.searchsorted(middle_s, np.append(grid_s, grid_s[-1] + GRID_S) - 0.5 * GRID_S)
+    seconds = np.diff(time[edges])
+    filled = seconds > 0
+    means = np.diff(integral[edges], axis=0)[filled] / seconds[filled, None]
+    return np.stack([np.interp(grid_s, grid_s[filled], each) for each in means.T], axis=1)
+
+
+def _smoothed(
+    start_s: float,
+    grid_s: FloatArray,
+    time_s: FloatArray,
+    rate: FloatArray,
+    force: FloatArray,
+    known: NDArray[np.bool_],
+) -> Series:
+    width = round(SMOOTHING_S / GRID_S)
+
+    def smoothed(values: FloatArray) -> FloatArray:
+        on_grid = np.stack([np.interp(grid_s, time_s, each) for each in values.T], axis=1)
+        return np.asarray(uniform_filter1d(on_grid, width, axis=0, mode="nearest"))
+
+    return Series(start_s, smoothed(rate), smoothed(force), known)

@@ -15,6 +15,7 @@ from tsgt.master.classic import UNTIMED_SIGMA_NS
 from tsgt.master.replay import replayed
 from tsgt.model import Status
 from tsgt.recording import load_recording
+from tsgt.simulation.checks.imu_samples import imu_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.pose_consistency import pose_failures
 from tsgt.simulation.mission import JournalIndex
@@ -58,6 +59,7 @@ def check_invariants(result: MissionResult) -> list[Violation]:
     - Timestamp errors are within the stated bounds.
     - Valid poses rest on usable measurements and agree with the truth within their covariance.
     - A replay of the recording reproduces the stream.
+    - Recorded samples of the IMU are those that it gave, at their true times.
     - After the faults, rates recover; collections in memory stay bounded.
     """
     found: list[Violation] = []
@@ -76,6 +78,7 @@ def check_invariants(result: MissionResult) -> list[Violation]:
         found += timestamp_violations(master_log, indices, start_ns=master_log.unix_at_zero_ns)
         found += (Violation("pose", what) for what in pose_failures(master_log, result))
         found += replay_mismatches(master_log)
+    found += (Violation("imu", what) for what in imu_failures(result))
     found += (Violation("liveness", what) for what in liveness_failures(result, indices))
     found += (Violation("memory", what) for what in result.oversized_collections)
     return found

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import copy
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -11,11 +13,14 @@ from harness.missions import SUPERFRAME, run_mission
 from tsgt.config import ScenarioConfig, SimulatedImu
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.checks.imu_samples import imu_failures
 from tsgt.simulation.scenario_files import with_stations
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
+    from tsgt.simulation.imu import DeviceSamples
     from tsgt.simulation.mission import MissionResult
 
 PIPELINE = ScenarioConfig().pipeline.model_copy(update={"estimator": "linear"})
@@ -47,6 +52,38 @@ def test_recording_holds_the_samples_at_their_times(mission: MissionResult) -> N
     late_s = stamps_s - samples.end_s[:count]
     np.testing.assert_allclose(late_s, mission.imu.truth.latency_s, atol=2e-4)
     assert load_recording(path).parameters.imu == mission.imu.parameters
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda samples: {"end_s": samples.end_s + 0.02}, "off by -20"),
+        (lambda samples: {"angular_rate_radps": samples.angular_rate_radps + 1e-6}, "has not given it"),
+        (lambda samples: {"device_ns": samples.device_ns + 1_000}, "has not given it"),
+    ],
+    ids=["time", "value", "device-clock"],
+)
+def test_wrong_samples_violate_the_invariant(
+    mission: MissionResult, change: Callable[[DeviceSamples], dict[str, Any]], found: str
+) -> None:
+    """A truth that differs from the recording in time or value is noticed."""
+    assert mission.imu is not None
+    samples = replace(mission.imu.samples, **change(mission.imu.samples))
+    wrong = replace(mission, imu=replace(mission.imu, samples=samples))
+    (failure,) = imu_failures(wrong)
+    assert found in failure
+
+
+def test_samples_missing_after_the_faults_violate_the_invariant(mission: MissionResult) -> None:
+    """All that arrive from 10 s after the last fault on must be recorded."""
+    assert mission.imu is not None
+    ended = replace(mission, faults_end_s=-7.0)
+    assert list(imu_failures(ended)) == []
+    (log,) = mission.master_logs
+    empty = copy.copy(log)
+    empty._folder = log._folder / "empty"
+    (failure,) = imu_failures(replace(ended, master_logs=[empty]))
+    assert "are not recorded" in failure
 
 
 def test_measurements_are_those_without_an_imu_but_shaken(mission: MissionResult, tmp_path: Path) -> None:

@@ -38,30 +38,37 @@ class Variates:
     products: FloatArray  # (P, P) inner products
     right: FloatArray  # (K, 18, P) right-hand sides of the normal equations
 
-    def combined(self, mixing: FloatArray) -> Variates:
-        """Return those of Q hyperparameters, by which the P change as the columns of ``mixing``, (P, Q), say."""
-        return Variates(mixing.T @ self.products @ mixing, self.right @ mixing)
-
 
 @dataclass(frozen=True, slots=True)
 class AverageInformation:
-    """Average information of hyperparameters, (P, P), and how the trajectory moves with them."""
+    """Average information of hyperparameters, and how the trajectory moves with them."""
 
-    information: FloatArray
+    information: FloatArray  # (Q, Q)
+    _mixing: FloatArray  # (P, Q) by which the P hyperparameters of the variates change with these
     _banded: FloatArray  # Cholesky factor of the normal equations
     _eliminated: FloatArray  # (18 K, P) its inverse times the right-hand sides
 
     @classmethod
-    def of(cls, solution: Solution, variates: Variates) -> AverageInformation:
-        """Eliminate the trajectory."""
+    def of(cls, solution: Solution, variates: Sequence[Variates], mixing: FloatArray) -> AverageInformation:
+        """Eliminate the trajectory; ``variates``: of P hyperparameters in all, of which (P, Q) ``mixing`` makes Q."""
         banded = solution.factor.banded
-        right = variates.right.reshape(banded.shape[1], -1)
-        eliminated, _ = dtbtrs(banded, right, uplo="L")
-        return cls(0.5 * (variates.products - eliminated.T @ eliminated), banded, eliminated)
+        right = np.empty((len(mixing), banded.shape[1]))
+        information = np.zeros((len(mixing), len(mixing)))
+        first = 0
+        for each in variates:
+            own = slice(first, first + len(each.products))
+            information[own, own] = each.products
+            right[own] = each.right.reshape(banded.shape[1], -1).T
+            first = own.stop
+        eliminated, _ = dtbtrs(banded, right.T, uplo="L", overwrite_b=True)
+        information -= eliminated.T @ eliminated
+        return cls(0.5 * mixing.T @ information @ mixing, mixing, banded, eliminated)
 
     def displacement(self, change: FloatArray) -> FloatArray:
-        """(K, 18) to first order, of the states by a change of the hyperparameters, (P,)."""
-        moved, _ = dtbtrs(self._banded, self._eliminated @ change[:, None], uplo="L", trans="T")
+        """(K, 18) to first order, of the states by a change of the hyperparameters, (Q,)."""
+        moved, _ = dtbtrs(
+            self._banded, self._eliminated @ (self._mixing @ change)[:, None], uplo="L", trans="T"
+        )
         return np.asarray(moved).reshape(-1, STATE_DIM)
 
 
@@ -130,10 +137,30 @@ def process_variates(
         ) + matvec(phi_by_time[:, None, kind], linearised.earlier[:, axes])
     weighted = process.information @ derived
     products = np.tensordot(derived, weighted, axes=((0, 1, 2), (0, 1, 2)))
-    return Variates(
-        products,
-        _transposed_process(weighted, process, linearised.rotation_by_earlier, linearised.rotation_by_later),
+    right = _transposed_process(
+        weighted, process, linearised.rotation_by_earlier, linearised.rotation_by_later
     )
+    # A correlation time also changes how accelerations last: a force on each, besides the noise of the steps.
+    for kind, axes in ((0, slice(0, 3)), (1, slice(3, 6))):
+        time = count + kind
+        force = (phi_by_time[:, None, kind, :, 2] * normalised[:, axes]).sum(axis=2)
+        right[:-1, 12 + 3 * kind : 15 + 3 * kind, time] += force
+        lasting = _lasting(force, process.phi[:, 3 * kind, 2, 2])
+        by_noise = np.einsum("ki,kip->p", lasting[1:], derived[:, axes, 2])
+        products[time] += by_noise
+        products[:, time] += by_noise
+        variances = step_sigmas[:, axes] ** 2 * (1.0 - process.phi[:, axes, 2, 2] ** 2)
+        first = step_sigmas[0, axes] * lasting[0]
+        products[time, time] += float((lasting[1:] ** 2 * variances).sum() + first @ first)
+    return Variates(products, right)
+
+
+def _lasting(force: FloatArray, decay: FloatArray) -> FloatArray:
+    """(K, 3) forces on all later accelerations that one at a knot meets, from those of the steps, (K - 1, 3)."""
+    banded = np.ones((2, len(decay) + 1))
+    banded[0, 1:] = -decay
+    lasting, _ = dtbtrs(banded, np.concatenate([force, np.zeros((1, 3))]), uplo="U")
+    return np.asarray(lasting)
 
 
 def _transposed_process(

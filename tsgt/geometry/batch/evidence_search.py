@@ -21,6 +21,8 @@ below."""
 
 _MAX_EVALUATIONS = 60
 _LEAST_INFORMATION = 1e-9  # Relative to that on the best determined combination of parameters
+_NEAR = 5.0
+_SECANTS, _MIN_CURVATURE = 3, 0.2
 _GOOD, _POOR = 0.5, 0.1  # Of the predicted gain
 
 
@@ -40,14 +42,18 @@ def maximise(
     A point at which the function raises GeometryError is avoided, except the first one.
     """
     at, here, radius = start, function(start), _FIRST_RADIUS
+    steps: list[tuple[FloatArray, FloatArray]] = []  # And the decreases of the gradient by them
     for _ in range(_MAX_EVALUATIONS):
-        step = newton_step(here, np.maximum(lower - at, -radius), np.minimum(upper - at, radius))
-        predicted = float(here.gradient @ step - 0.5 * step @ here.information @ step)
+        model = _with_secants(here, steps)
+        step = newton_step(model, np.maximum(lower - at, -radius), np.minimum(upper - at, radius))
+        predicted = float(here.gradient @ step - 0.5 * step @ model.information @ step)
         if predicted < _TOLERANCE:
             return at + step, here.value + predicted
         try:
             there = function(at + step)
             gain = there.value - here.value
+            if predicted < _NEAR:
+                steps = [*steps, (step, here.gradient - there.gradient)][-_SECANTS:]
         except GeometryError:
             gain = -np.inf
         if gain > _GOOD * predicted:
@@ -59,6 +65,20 @@ def maximise(
         if radius < _MIN_RADIUS:
             break
     return at, here.value
+
+
+def _with_secants(here: Curved, steps: list[tuple[FloatArray, FloatArray]]) -> Curved:
+    """Correct the information by that which recent steps found along them (BFGS)."""
+    information = here.information
+    for step, decrease in steps:
+        expected, found = information @ step, float(step @ decrease)
+        if found > _MIN_CURVATURE * float(step @ expected):
+            information = (
+                information
+                - np.outer(expected, expected) / float(step @ expected)
+                + np.outer(decrease, decrease) / found
+            )
+    return here._replace(information=information)
 
 
 def newton_step(here: Curved, lowest: FloatArray, highest: FloatArray) -> FloatArray:

@@ -16,7 +16,6 @@ from tsgt.errors import GeometryError
 from tsgt.geometry.batch.adaptive_noise import ADAPTATIONS, adapted_sigmas
 from tsgt.geometry.batch.average_information import (
     AverageInformation,
-    Variates,
     measurement_variates,
     process_variates,
 )
@@ -35,6 +34,7 @@ from tsgt.geometry.batch.process_moments import (
 from tsgt.geometry.batch.rest import rest_factors, steps_in_rest
 from tsgt.geometry.batch.rest_detection import find_rest
 from tsgt.geometry.trajectory.gauss_newton import (
+    LOOSE_GAIN_TOLERANCE,
     REJECTION_THRESHOLD,
     knot_times,
     log_evidence,
@@ -96,9 +96,8 @@ class _Segment:
     """One segment of measurements and its most probable trajectory so far, the initial guess of the next evaluation."""
 
     def __init__(self, observations: Observations) -> None:
-        self.observations = _without_blunders(observations)
+        self.observations, self.knots = _without_blunders(observations)
         self.rest = find_rest(observations)
-        self.knots: States = initial_guess(self.observations, knot_times(self.observations.time_s))
         self.moving = ~steps_in_rest(self.rest, self.knots.time_s)
         self.local = np.ones((len(self.moving), 6))  # Factors on the variance of the accelerations
         self.log_evidence = -np.inf
@@ -124,6 +123,7 @@ class _Segment:
                 sigmas=sigmas,
                 rest=rest,
                 max_iterations=_ADAPTED_ITERATIONS,
+                gain_tolerance=LOOSE_GAIN_TOLERANCE,
                 reject_outliers=False,
             )
             self.knots = solution.knots
@@ -252,12 +252,22 @@ def _segments(observations: Observations) -> list[_Segment]:
     return found
 
 
-def _without_blunders(observations: Observations) -> Observations:
-    """Remove measurements of something else, which say nothing about the noise: a few of them would double a factor."""
+def _without_blunders(observations: Observations) -> tuple[Observations, States]:
+    """Remove measurements of something else, which say nothing about the noise: a few of them would double a factor.
+
+    Return a first trajectory as well.
+    """
     guess = initial_guess(observations, knot_times(observations.time_s))
-    squared = solve(observations, guess, MotionPrior(), reject_outliers=False).squared_distances
+    solution = solve(
+        observations, guess, MotionPrior(), gain_tolerance=LOOSE_GAIN_TOLERANCE, reject_outliers=False
+    )
+    squared = solution.squared_distances
     scale_squared = max(float(np.median(squared)) / _MEDIAN_SQUARED_DISTANCE, 1.0)
-    return observations.select(squared <= REJECTION_THRESHOLD**2 * scale_squared)
+    kept = squared <= REJECTION_THRESHOLD**2 * scale_squared
+    if kept.all():
+        return observations, solution.knots
+    observations = observations.select(kept)
+    return observations, initial_guess(observations, knot_times(observations.time_s))
 
 
 def log_parameters(prior: MotionPrior, scales: FloatArray) -> FloatArray:
@@ -304,7 +314,15 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> Curved:
     observations = _with_noise(segment.observations, parameters)
     step_sigmas, rest = segment.factors(prior)
     guess = segment.guess(parameters)
-    solution = solve(observations, guess, prior, sigmas=step_sigmas, rest=rest, reject_outliers=False)
+    solution = solve(
+        observations,
+        guess,
+        prior,
+        sigmas=step_sigmas,
+        rest=rest,
+        gain_tolerance=LOOSE_GAIN_TOLERANCE,
+        reject_outliers=False,
+    )
     value = log_evidence(solution, observations, prior, step_sigmas)
     information = _average_information(segment, parameters, solution, observations, step_sigmas)
     segment.record(solution.knots, value, parameters, information)
@@ -353,14 +371,12 @@ def _average_information(
         scaled=segment.moving,
     )
     noise = measurement_variates(solution, observations)
-    by_process = np.zeros((len(process.products), len(parameters)))
-    by_process[np.arange(len(by_process)), [*sigma_parameters, *_TIME_PARAMETERS]] = 1.0
-    by_noise = np.zeros((len(noise.products), len(parameters)))
-    by_noise[:-1, _SCALE_PARAMETER] = 1.0
-    by_noise[:, _SCALE_PARAMETER + 1 :] = np.eye(len(by_noise))
-    mixed = process.combined(by_process), noise.combined(by_noise)
-    total = Variates(mixed[0].products + mixed[1].products, mixed[0].right + mixed[1].right)
-    return AverageInformation.of(solution, total)
+    mixing = np.zeros((len(process.products) + len(noise.products), len(parameters)))
+    count = len(process.products)
+    mixing[np.arange(count), [*sigma_parameters, *_TIME_PARAMETERS]] = 1.0
+    mixing[count:-1, _SCALE_PARAMETER] = 1.0
+    mixing[count:, _SCALE_PARAMETER + 1 :] = np.eye(len(mixing) - count)
+    return AverageInformation.of(solution, (process, noise), mixing)
 
 
 def _expected_log_density(

@@ -60,6 +60,9 @@ PREDICTED_GAIN_TOLERANCE = 1e-2
 sigma, and the derivatives by far less than the rounding of the result.
 """
 
+LOOSE_GAIN_TOLERANCE = 3.0
+"""The same on the way to other sigmas, where the next search starts. The gain of so small a step is as predicted to a percent."""
+
 _MEASUREMENTS_PER_CHUNK, _FACTORS_PER_CHUNK = 128, 256  # Stay in the L1 cache: twice as fast
 MIN_STEP_FRACTION = 1e-3  # Smallest fraction of a step that the line search tries
 
@@ -148,19 +151,22 @@ def solve(
     sigmas: FloatArray | None = None,
     rest: FloatArray | None = None,
     max_iterations: int = MAX_ITERATIONS,
+    gain_tolerance: float = PREDICTED_GAIN_TOLERANCE,
     reject_outliers: bool = True,
 ) -> Solution:
     """Find the maximum a posteriori trajectory from observations in any order.
 
     ``guess``: states at the knot times of the result; rotations within about a radian of the solution. ``anchor``: prior on
     the first knot; diffuse when not given. ``sigmas``: (K - 1, 6) acceleration sigmas of each step instead of those of
-    ``prior``; ``rest``: of :class:`ProcessFactors`. ``reject_outliers``: solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`; without, the
-    solution is a smooth function of its inputs. Raises GeometryError: the measurements do not determine the trajectory.
+    ``prior``; ``rest``: of :class:`ProcessFactors`. ``gain_tolerance``: see :data:`PREDICTED_GAIN_TOLERANCE`.
+    ``reject_outliers``: solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`; without, the solution is
+    a smooth function of its inputs. Raises GeometryError: the measurements do not determine the trajectory.
     """
     anchor = diffuse_prior(guess.select(slice(0, 1)), prior) if anchor is None else anchor
     knot_index = nearest_knots(guess.time_s, observations.time_s)
     process = ProcessFactors.of(guess.time_s, prior, sigmas, rest)
-    found = _minimise(observations, knot_index, guess, process, anchor, max_iterations)
+    limits = max_iterations, gain_tolerance
+    found = _minimise(observations, knot_index, guess, process, anchor, *limits)
     if not reject_outliers or not (found.squared_distances > REJECTION_THRESHOLD**2).any():
         return found
     # The guess of a rotation across the outage of a prism may lead to a local minimum, where good measurements are outliers.
@@ -168,15 +174,15 @@ def solve(
         coarse = guess
         for scale in COARSE_NOISE_SCALES:
             rough = replace(observations, sigmas_m=scale * observations.sigmas_m)
-            coarse = _minimise(rough, knot_index, coarse, process, anchor, max_iterations).knots
+            coarse = _minimise(rough, knot_index, coarse, process, anchor, *limits).knots
         found = min(
             found,
-            _minimise(observations, knot_index, coarse, process, anchor, max_iterations),
+            _minimise(observations, knot_index, coarse, process, anchor, *limits),
             key=lambda solution: solution.cost,
         )
     # Only after convergence: far from the solution, good measurements exceed the threshold too.
     rejectable = np.ones(len(knot_index), np.bool_)
-    second = _minimise(observations, knot_index, found.knots, process, anchor, max_iterations, rejectable)
+    second = _minimise(observations, knot_index, found.knots, process, anchor, *limits, rejectable)
     return second._replace(iterations=max(found.iterations, second.iterations))
 
 
@@ -187,6 +193,7 @@ def _minimise(
     process: ProcessFactors,
     anchor: AnchorPrior,
     max_iterations: int,
+    gain_tolerance: float,
     rejectable: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Run Gauss-Newton with backtracking until the cost or the predicted gain falls below its tolerance."""
@@ -200,7 +207,7 @@ def _minimise(
     while iterations < max_iterations:
         iterations += 1
         step = factor.solve(-system.gradient)
-        if -float(np.vdot(step, system.gradient)) < PREDICTED_GAIN_TOLERANCE:
+        if -float(np.vdot(step, system.gradient)) < gain_tolerance:
             knots, system = knots.retract(step), apply_linear_step(system, knot_index, step)
             break
         candidate, candidate_knots = _line_search(evaluate, knots, step, system)

@@ -1,6 +1,6 @@
 """Many simulated missions with faults of all kinds, each from one seed, and what must never happen counted in all of them.
 
-    python benchmarks/run.py soak [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--json FILE]
+    python benchmarks/run.py soak [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--imu MODEL] [--json FILE]
 
 Protocol, estimator, losses and drifts change from seed to seed, and with them how often which faults come
 (`tsgt/simulation/faults/catalogue.py`). A line for each violation says how to get the same run again. `make soak` runs it for a
@@ -38,6 +38,7 @@ from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
+    from tsgt.config import ImuModelName
     from tsgt.simulation.mission import MissionResult
 
 DURATION_S = 220.0
@@ -54,9 +55,10 @@ class Mission:
     estimator: Literal["linear", "continuous"]
     loss: float
     drift_ppm: float
+    imu: ImuModelName
 
     @classmethod
-    def of(cls, seed: int) -> Mission:
+    def of(cls, seed: int, imu: ImuModelName = "none") -> Mission:
         """Draw it; a quarter of the missions have the continuous estimator, which takes most of the time."""
         rng = np.random.default_rng([seed, 0x50AC])
         protocol: Literal["superframe", "classic"] = "superframe" if rng.random() < 0.5 else "classic"
@@ -67,6 +69,7 @@ class Mission:
             # With one packet in ten lost, classic has too few measurements for `linear` even without faults.
             float(rng.choice([0.0, 0.02, 0.1] if protocol == "superframe" else [0.0, 0.02])),
             round(float(rng.uniform(-50, 50)), 1),
+            imu,
         )
 
     @property
@@ -74,7 +77,7 @@ class Mission:
         """The command that runs it again."""
         return (
             f"tsgt simulate dynamic --protocol {self.protocol} --duration {DURATION_S:g} --loss {self.loss} "
-            f"--drift-ppm {self.drift_ppm} --faults all --estimator {self.estimator} --seed {self.seed}"
+            f"--drift-ppm {self.drift_ppm} --faults all --estimator {self.estimator} --imu {self.imu} --seed {self.seed}"
         )
 
 
@@ -120,17 +123,18 @@ class Sums:
         self.next_seed = max(self.next_seed, other.next_seed)
 
 
-def run(seed: int) -> Sums:
+def run(seed: int, imu: ImuModelName = "none") -> Sums:
     """Run a mission and check it."""
     configure_logging("critical")
     logging.disable(logging.CRITICAL)  # asyncio's, of daemons that are killed
-    mission = Mission.of(seed)
+    mission = Mission.of(seed, imu)
     kind = f"{mission.protocol}, {mission.estimator}"
     sums = Sums(next_seed=seed + 1, missions=Counter({kind: 1}))
     scenario = find_scenario("dynamic")
     pipeline = scenario.pipeline.model_copy(update={"estimator": mission.estimator})
     radio = scenario.radio.model_copy(update={"loss_probability": mission.loss})
-    scenario = scenario.model_copy(update={"pipeline": pipeline, "radio": radio})
+    robot = scenario.imu.model_copy(update={"model": mission.imu})
+    scenario = scenario.model_copy(update={"pipeline": pipeline, "radio": radio, "imu": robot})
     options = SimulationOptions(
         duration_s=DURATION_S,
         drift_ppm=mission.drift_ppm,
@@ -208,6 +212,12 @@ def main() -> int:
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count(), help="how many at once (default: all cores)"
     )
+    parser.add_argument(
+        "--imu",
+        choices=["none", "industrial", "consumer"],
+        default="none",
+        help="the robot's IMU (default: none)",
+    )
     parser.add_argument("--json", type=Path, help="keep the sums here, and go on from them")
     arguments = parser.parse_args()
     sums = Sums(next_seed=arguments.first)
@@ -224,7 +234,7 @@ def main() -> int:
         running: set[Future[Sums]] = set()
         while running or (time.monotonic() < ends_s and seed != last):
             while len(running) < arguments.jobs and time.monotonic() < ends_s and seed != last:
-                running.add(pool.submit(run, seed))
+                running.add(pool.submit(run, seed, arguments.imu))
                 seed += 1
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for each in done:

@@ -74,6 +74,14 @@ def test_wrong_samples_violate_the_invariant(
     assert found in failure
 
 
+def test_recording_without_a_line_has_no_samples(mission: MissionResult, tmp_path: Path) -> None:
+    """A master that is killed at once leaves an empty file."""
+    (tmp_path / "master.jsonl").touch()
+    empty = copy.copy(mission.master_logs[0])
+    empty._folder = tmp_path
+    assert list(imu_failures(replace(mission, master_logs=[*mission.master_logs, empty]))) == []
+
+
 def test_samples_missing_after_the_faults_violate_the_invariant(mission: MissionResult) -> None:
     """All that arrive from 10 s after the last fault on must be recorded."""
     assert mission.imu is not None

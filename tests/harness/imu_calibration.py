@@ -10,7 +10,7 @@ from harness.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.inertial import Gravity, Mounting
-from tsgt.geometry.inertial_calibration import ImuSetup, symmetric_gauge
+from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
 
 if TYPE_CHECKING:
     from tsgt.geometry.inertial import InertialSamples
@@ -52,13 +52,14 @@ def uncalibrated_drive(
     )
     centroid = drive.layout.mean(axis=0)
     mounted = rotation_from_quaternion(np.array(imu.orientation_xyzw))
-    rotation, gyro_matrix = symmetric_gauge(mounted, np.asarray(np.linalg.inv(gyro), np.float64))
+    rotation, gyro_matrix = in_main_axes(mounted, np.asarray(np.linalg.inv(gyro), np.float64), 2)
     truth = ImuSetup(
         Mounting(rotation, np.array(imu.position_m) - centroid),
         latency_s,
         gyro_matrix,
         rotation.T @ mounted @ np.linalg.inv(accelerometer),
         np.zeros(3),
+        2,
     )
     observations = replace(drive.measure(seed=seed), layout=drive.layout - centroid)
     return UncalibratedDrive(observations, samples, imu, truth)

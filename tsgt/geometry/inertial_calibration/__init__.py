@@ -6,7 +6,7 @@ causes of a set-up that contradicts the data. docs/explanation/imu.md derives th
 
 from tsgt.geometry.inertial_calibration.alignment import Alignment, align, series_of_samples, series_of_states
 from tsgt.geometry.inertial_calibration.calibration import ImuCalibration, calibrate_imu
-from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, symmetric_gauge
+from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_main_axes
 
 __all__ = [
     "Alignment",
@@ -15,7 +15,7 @@ __all__ = [
     "SetupPrior",
     "align",
     "calibrate_imu",
+    "in_main_axes",
     "series_of_samples",
     "series_of_states",
-    "symmetric_gauge",
 ]

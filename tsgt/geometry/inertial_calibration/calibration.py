@@ -14,7 +14,7 @@ import numpy as np
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.batch import fit_trajectory
-from tsgt.geometry.inertial import InertialStates, Mounting, contiguous, estimation_noise
+from tsgt.geometry.inertial import InertialStates, Mounting, contiguous
 from tsgt.geometry.inertial.solver import diffuse_inertial_prior
 from tsgt.geometry.inertial.states import TILT_DIM
 from tsgt.geometry.inertial_calibration.alignment import Alignment, align, series_of_samples, series_of_states
@@ -95,7 +95,6 @@ def calibrate_imu(
     check_duration(observations, samples)
     fit = fit_trajectory(observations, on_progress=lambda share: report(0.5 * share))
     alignment = align(series_of_states(fit.trajectory.knots, gravity), series_of_samples(samples))
-    noise = estimation_noise(noise)
     filled = contiguous(samples, noise)
     initial = ImuSetup.initial(
         Mounting(alignment.rotation, np.zeros(3)), alignment.latency_s, int(observations.station.max()) + 1

@@ -28,7 +28,7 @@ from tsgt.geometry.inertial_calibration.setup import (
     LATENCY,
     POSITION,
     ROTATION,
-    SYMMETRIC,
+    gyro_directions,
 )
 from tsgt.geometry.rigid import FloatArray, exp_so3, fast_log_so3, inverse_right_jacobian, matvec, skew
 from tsgt.geometry.trajectory import coupling, nearest_knots
@@ -203,7 +203,9 @@ def motion_by_matrices(
         samples, knots.time_s[:-1], knots.time_s[1:], found.gyro_bias, found.accelerometer_bias
     )
     # From errors by which values are multiplied to those that are added to the matrices.
-    by_gyro = np.einsum("kril,jl,sij->krs", by_rate, np.linalg.inv(setup.gyro_matrix), SYMMETRIC)
+    by_gyro = np.einsum(
+        "kril,jl,sij->krs", by_rate, np.linalg.inv(setup.gyro_matrix), gyro_directions(setup.main_axis)
+    )
     by_accelerometer = (by_force @ np.linalg.inv(setup.accelerometer_matrix).T).reshape(len(found), 9, 9)
     by_error = np.concatenate([by_gyro, by_accelerometer], axis=2)
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))

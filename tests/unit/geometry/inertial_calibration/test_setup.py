@@ -1,12 +1,14 @@
-"""Errors of a set-up, and the gauge that makes the gyro matrix symmetric."""
+"""Errors of a set-up, and the axes that they are counted in."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tsgt.geometry import exp_so3
 from tsgt.geometry.inertial import Mounting
-from tsgt.geometry.inertial_calibration import ImuSetup, symmetric_gauge
+from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
+from tsgt.geometry.inertial_calibration.setup import gyro_directions
 
 
 def test_retraction_and_local_coordinates_are_inverse() -> None:
@@ -17,12 +19,17 @@ def test_retraction_and_local_coordinates_are_inverse() -> None:
     np.testing.assert_allclose(setup.retract(error).local_coordinates_about(setup), error, atol=1e-12)
 
 
-def test_symmetric_gauge_keeps_the_rates_of_the_robot() -> None:
-    """Mounting times matrix stays the same, the matrix becomes symmetric and the rotation stays one."""
+@pytest.mark.parametrize("main_axis", [0, 1, 2])
+def test_main_axes_keep_the_rates_of_the_robot(main_axis: int) -> None:
+    """Mounting times matrix stays the same, the rotation stays one, and the matrix keeps its free components alone."""
     rng = np.random.default_rng(1)
-    rotation, matrix = exp_so3(rng.normal(size=3)), np.eye(3) + rng.normal(scale=0.01, size=(3, 3))
-    turned, symmetric = symmetric_gauge(rotation, matrix)
-    np.testing.assert_allclose(turned @ symmetric, rotation @ matrix, atol=1e-12)
-    np.testing.assert_allclose(symmetric, symmetric.T, atol=1e-12)
+    rotation, matrix = exp_so3(rng.normal(size=3)), np.eye(3) + rng.normal(scale=0.02, size=(3, 3))
+    turned, found = in_main_axes(rotation, matrix, main_axis)
+    np.testing.assert_allclose(turned @ found, rotation @ matrix, atol=1e-12)
     np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turned) > 0
+    directions = gyro_directions(main_axis)
+    free = directions.reshape(6, 9)
+    remaining = (found - np.eye(3)).ravel()
+    remaining = remaining - free.T @ np.linalg.solve(free @ free.T, free @ remaining)
+    assert np.abs(remaining).max() < 1e-7

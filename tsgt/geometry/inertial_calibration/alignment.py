@@ -8,7 +8,7 @@ robot that turns about one axis only leaves the rotation about this axis open; t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -32,7 +32,8 @@ FORCE_SIGMA_MPS2 = (
     0.5  # Of the difference between the IMU and the stations, smoothed; includes the lever arm's
 )
 MIN_TURNING_RADPS = 0.03  # rms about the mean
-MIN_CORRELATION = 0.5
+MIN_CORRELATION = 0.96
+"""Of rates without noise; the share of the noise is the sigma above. The slow turns of two drives may agree to 0.95."""
 MIN_OVERLAP_S = 20.0
 
 
@@ -48,12 +49,19 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Angular rates and specific forces on a grid, smoothed, (N, 3) each; NaN-free, ``known`` where they hold."""
+    """Angular rates and specific forces on a grid, smoothed, (N, 3) each."""
 
     start_s: float
     rate: FloatArray
     force: FloatArray
-    known: NDArray[np.bool_]
+    known: NDArray[np.bool_]  # (N,) where they hold
+
+
+class Products(NamedTuple):
+    """Sums of products of the robot's and the IMU's vectors, in their sigmas, as of independent instants."""
+
+    rates: FloatArray  # (3, 3) about the means
+    forces: FloatArray  # (3, 3)
 
 
 def series_of_states(states: States, gravity: Gravity) -> Series:
@@ -84,15 +92,15 @@ def series_of_samples(samples: InertialSamples) -> Series:
 
 def align(robot: Series, imu: Series, *, max_latency_s: float = MAX_LATENCY_S) -> Alignment:
     """Find mounting and latency. Raises GeometryError: the robot hardly turns, or no latency explains the rates."""
-    turning = float(np.sqrt(np.var(robot.rate[robot.known], axis=0).sum()))
-    if turning < MIN_TURNING_RADPS:
+    if not turns(robot):
         raise GeometryError(
-            f"the robot hardly turns (rms {np.degrees(turning):.1f} deg/s): drive curves, slopes and bumps"
+            f"the robot hardly turns (rms below {np.degrees(MIN_TURNING_RADPS):.1f} deg/s): drive curves, slopes and bumps"
         )
     lags, scores = _rate_scores(robot, imu, max_latency_s)
     best = int(np.argmax(scores))
     correlation = float(scores[best])
-    if correlation < MIN_CORRELATION:
+    turning = _turning(robot)
+    if correlation < MIN_CORRELATION * turning / np.hypot(turning, RATE_SIGMA_RADPS):
         raise GeometryError(
             f"the angular rates of the IMU are not those of the robot at any latency within {max_latency_s:g} s "
             f"(correlation {correlation:.2f}): another recording's IMU, or damaged samples"
@@ -103,12 +111,30 @@ def align(robot: Series, imu: Series, *, max_latency_s: float = MAX_LATENCY_S) -
         curvature = before - 2 * at + after
         if curvature < 0:
             latency_s += 0.5 * GRID_S * float((before - after) / curvature)
+    products = products_at(robot, imu, latency_s)
+    rotation = nearest_rotation(products.rates + products.forces)
     ours, theirs = _overlap(robot, imu, int(lags[best]))
+    gyro_bias = np.asarray((imu.rate[theirs] - robot.rate[ours] @ rotation).mean(axis=0))
+    return Alignment(rotation, latency_s, gyro_bias, correlation)
+
+
+def turns(robot: Series) -> bool:
+    """Whether a robot turns enough to align its rates."""
+    return _turning(robot) >= MIN_TURNING_RADPS
+
+
+def _turning(robot: Series) -> float:
+    return float(np.sqrt(np.var(robot.rate[robot.known], axis=0).sum()))
+
+
+def products_at(robot: Series, imu: Series, latency_s: float) -> Products:
+    """Return sums of products at a latency, to the nearest step of the grid."""
+    ours, theirs = _overlap(robot, imu, round((latency_s + robot.start_s - imu.start_s) / GRID_S))
     w, g = robot.rate[ours], imu.rate[theirs]
-    forces = robot.force[ours].T @ imu.force[theirs] / FORCE_SIGMA_MPS2**2
     rates = (w - w.mean(axis=0)).T @ (g - g.mean(axis=0)) / RATE_SIGMA_RADPS**2
-    rotation = nearest_rotation(rates + forces)
-    return Alignment(rotation, latency_s, np.asarray((g - w @ rotation).mean(axis=0)), correlation)
+    forces = robot.force[ours].T @ imu.force[theirs] / FORCE_SIGMA_MPS2**2
+    share = GRID_S / SMOOTHING_S  # Of the points of the grid
+    return Products(share * rates, share * forces)
 
 
 def nearest_rotation(products: FloatArray) -> FloatArray:

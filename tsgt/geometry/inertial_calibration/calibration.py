@@ -22,12 +22,12 @@ from tsgt.geometry.inertial_calibration.joint_solver import (
     JointSolution,
     minimise,
     solve_jointly,
+    states_of_imu,
     without_tilt,
 )
 from tsgt.geometry.inertial_calibration.joint_system import assemble_border, assemble_states, stamp_times
 from tsgt.geometry.inertial_calibration.setup import MOUNTING_DIM, ImuSetup, SetupPrior
 from tsgt.geometry.motion_calibration.timestamp_drift import SegmentInformation, birge_ratio
-from tsgt.geometry.rigid import cross, matvec
 from tsgt.geometry.trajectory.block_tridiagonal import factorise
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.inertial import Gravity, InertialSamples
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import Observations, Trajectory
+    from tsgt.geometry.trajectory import Observations
     from tsgt.model import ImuNoise
 
 MIN_DURATION_S = 60.0
@@ -106,7 +106,7 @@ def calibrate_imu(
         raise GeometryError(f"samples and measurements have less than {MIN_DURATION_S:g} s in common")
 
     def guess(times_s: FloatArray, setup: ImuSetup) -> InertialStates:
-        return states_of_imu(fit.trajectory, times_s, setup, alignment.gyro_bias)
+        return states_of_imu(fit.trajectory.knots, times_s, setup, alignment.gyro_bias)
 
     done = 0
 
@@ -214,21 +214,3 @@ def _evidence(solution: JointSolution, prior: SetupPrior) -> float:
     normal = np.eye(len(sigmas)) + sigmas[:, None] * information * sigmas
     scaled = sigmas * at_mean
     return 0.5 * float(scaled @ np.linalg.solve(normal, scaled) - np.linalg.slogdet(normal)[1])
-
-
-def states_of_imu(
-    trajectory: Trajectory, stamps_s: FloatArray, setup: ImuSetup, gyro_bias: FloatArray
-) -> InertialStates:
-    """States of an IMU at stamps from the stations' trajectory of the robot."""
-    states, _ = trajectory.at(stamps_s - setup.latency_s, dim=9)
-    mounting = setup.mounting
-    arm = matvec(states.rotation, mounting.position)
-    turning = matvec(states.rotation, cross(states.angular_velocity, mounting.position))
-    return InertialStates(
-        stamps_s,
-        states.position + arm,
-        states.rotation @ mounting.rotation,
-        states.velocity + turning,
-        np.tile(gyro_bias, (len(stamps_s), 1)),
-        np.zeros_like(arm),
-    )

@@ -22,7 +22,8 @@ from tsgt.geometry.inertial_calibration.joint_system import (
     knots_at_samples,
     stamp_times,
 )
-from tsgt.geometry.rigid import exp_so3, matvec
+from tsgt.geometry.rigid import cross, exp_so3, matvec
+from tsgt.geometry.trajectory import nearest_knots
 from tsgt.geometry.trajectory.gauss_newton import (
     COST_TOLERANCE,
     MIN_STEP_FRACTION,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.inertial import ContiguousSamples, Gravity
     from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import Observations
+    from tsgt.geometry.trajectory import Observations, States
     from tsgt.model import ImuNoise
 
 MAX_ITERATIONS = 25
@@ -158,3 +159,25 @@ def without_tilt(anchor: InertialAnchor) -> InertialAnchor:
     information = anchor.information.copy()
     information[-TILT_DIM:] = information[:, -TILT_DIM:] = 0.0
     return replace(anchor, information=information)
+
+
+def states_of_imu(
+    robot: States, stamps_s: FloatArray, setup: ImuSetup, gyro_bias: FloatArray
+) -> InertialStates:
+    """States of an IMU at stamps, from states of the robot at knots of which some are near."""
+    at_s = stamps_s - setup.latency_s
+    states = robot.select(nearest_knots(robot.time_s, at_s))
+    delta_s = (at_s - states.time_s)[:, None]
+    rotation = states.rotation @ exp_so3(states.angular_velocity * delta_s)
+    mounting = setup.mounting
+    arm = matvec(rotation, mounting.position)
+    return InertialStates(
+        stamps_s,
+        states.position + states.velocity * delta_s + 0.5 * states.acceleration * delta_s**2 + arm,
+        rotation @ mounting.rotation,
+        states.velocity
+        + states.acceleration * delta_s
+        + matvec(rotation, cross(states.angular_velocity, mounting.position)),
+        np.tile(gyro_bias, (len(stamps_s), 1)),
+        np.zeros_like(arm),
+    )

@@ -1,0 +1,161 @@
+"""A wrong configuration of an IMU is noticed, with its cause; a right one is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.imu_calibration import uncalibrated_drive
+
+from tsgt.geometry import exp_so3
+from tsgt.geometry.batch import fit_trajectory
+from tsgt.geometry.inertial_calibration import SetupFinding, check_imu_setup
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import Gravity, InertialSamples, Mounting
+    from tsgt.geometry.trajectory import Observations, States
+    from tsgt.model import ImuNoise
+
+DEG = np.pi / 180
+
+
+@dataclass(frozen=True)
+class Configured:
+    """A drive of 50 s with an IMU as it is configured; exactly, unless changed."""
+
+    observations: Observations
+    states: States
+    samples: InertialSamples
+    mounting: Mounting
+    noise: ImuNoise
+    gravity: Gravity
+
+    def check(self) -> list[SetupFinding]:
+        """Check it."""
+        return check_imu_setup(
+            self.observations, self.states, self.samples, self.mounting, self.noise, self.gravity
+        )
+
+    def sampled(self, rates: FloatArray, forces: FloatArray | None = None, late_s: float = 0.0) -> Configured:
+        """Return samples that are multiplied by matrices, and late."""
+        samples = replace(
+            self.samples,
+            end_s=self.samples.end_s + late_s,
+            angular_rate_radps=self.samples.angular_rate_radps @ rates.T,
+            specific_force_mps2=self.samples.specific_force_mps2 @ (rates if forces is None else forces).T,
+        )
+        return replace(self, samples=samples)
+
+
+@cache
+def drive(grade: str = "industrial", seed: int = 0) -> Configured:
+    """Drive, with samples as the estimator takes them."""
+    found = uncalibrated_drive(50.0, grade=grade, seed=seed)
+    fit = fit_trajectory(found.observations)
+    samples = replace(
+        found.samples,
+        end_s=found.samples.end_s - found.truth.latency_s,
+        angular_rate_radps=found.samples.angular_rate_radps @ found.truth.gyro_matrix.T,
+    )
+    return Configured(
+        fit.observations, fit.trajectory.knots, samples, found.truth.mounting, found.imu.noise, found.gravity
+    )
+
+
+def only(findings: list[SetupFinding]) -> SetupFinding:
+    """Return the only finding."""
+    (finding,) = findings
+    return finding
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_mounting_one_degree_off(axis: int) -> None:
+    """A degree about any axis is named with its size."""
+    right = drive()
+    turn = exp_so3(DEG * np.eye(3)[axis])
+    wrong = replace(right, mounting=replace(right.mounting, rotation=right.mounting.rotation @ turn))
+    finding = only(wrong.check())
+    assert finding.cause == "rotation"
+    assert finding.size == pytest.approx(DEG, abs=max(4 * finding.sigma, 0.1 * DEG))
+    assert "the mounting of the IMU is wrong by" in finding.text
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_lever_arm_100_mm_off(axis: int) -> None:
+    """A decimetre along any axis is named with its size."""
+    right = drive()
+    position = right.mounting.position + 0.1 * np.eye(3)[axis]
+    finding = only(replace(right, mounting=replace(right.mounting, position=position)).check())
+    assert finding.cause == "position"
+    assert finding.size == pytest.approx(0.1, abs=max(4 * finding.sigma, 0.005))
+
+
+@pytest.mark.parametrize("late_s", [0.01, -0.01, 2.0])
+def test_clock_off(late_s: float) -> None:
+    """Ten milliseconds and two seconds are named with their size."""
+    finding = only(drive().sampled(np.eye(3), late_s=late_s).check())
+    assert finding.cause == "latency"
+    assert finding.size == pytest.approx(abs(late_s), abs=0.002)
+    assert ("stamps are +" in finding.text) == (late_s > 0)
+
+
+def test_swapped_axes() -> None:
+    """Axes in another order are described."""
+    swapped = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    finding = only(drive().sampled(swapped).check())
+    assert finding.cause == "axes"
+    assert "its x is the configured -y, its y is the configured x, its z is the configured z" in finding.text
+
+
+def test_left_handed_axes() -> None:
+    """Two exchanged axes are no rotation."""
+    finding = only(drive().sampled(np.eye(3)[[1, 0, 2]]).check())
+    assert finding.cause == "axes"
+    assert "left-handed" in finding.text
+
+
+def test_wrong_units() -> None:
+    """Degrees per second and multiples of gravity are recognised."""
+    right = drive()
+    rates = only(right.sampled(np.eye(3) / DEG, np.eye(3)).check())
+    assert (rates.cause, rates.text.count("degrees per second")) == ("unit_of_rate", 1)
+    forces = only(right.sampled(np.eye(3), np.eye(3) / 9.81).check())
+    assert (forces.cause, forces.text.count("g instead of")) == ("unit_of_force", 1)
+
+
+def test_sign_of_gravity() -> None:
+    """A device that gives accelerations with gravity pointing down."""
+    assert only(drive().sampled(np.eye(3), -np.eye(3)).check()).cause == "gravity_sign"
+
+
+def test_samples_of_another_robot() -> None:
+    """Rates that have nothing to do with the robot's."""
+    right = drive()
+    reversed_rates = right.samples.angular_rate_radps[::-1].copy()
+    other = replace(right, samples=replace(right.samples, angular_rate_radps=reversed_rates))
+    assert only(other.check()).cause == "unrelated"
+
+
+def test_robot_at_rest_tells_nothing() -> None:
+    """Without turning there is no finding, whatever is wrong."""
+    right = drive().sampled(np.eye(3) / DEG)
+    still = replace(right.states, angular_velocity=np.zeros_like(right.states.angular_velocity))
+    assert replace(right, states=still).check() == []
+
+
+@pytest.mark.parametrize("grade", ["industrial", "consumer"])
+def test_right_setup_is_not_reported(grade: str) -> None:
+    """No false alarm."""
+    assert drive(grade).check() == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grade", ["industrial", "consumer"])
+def test_no_false_alarm_on_clean_drives(grade: str) -> None:
+    """Twenty drives of each class."""
+    for seed in range(20):
+        assert drive(grade, 100 + seed).check() == [], seed

@@ -1,0 +1,227 @@
+"""Check of a configured IMU against the motion that stations measure: wrong mounting, latency, axes, units. Sans-I/O.
+
+Gross errors, which no estimate survives, show in the rates and forces themselves. For the others the set-up is estimated as in a
+calibration, and compared with the configured one: a cause is named if it is significant and large enough to harm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+from tsgt.geometry.inertial import Mounting, contiguous
+from tsgt.geometry.inertial.states import TILT_DIM
+from tsgt.geometry.inertial_calibration.alignment import (
+    align,
+    nearest_rotation,
+    products_at,
+    series_of_samples,
+    series_of_states,
+    turns,
+)
+from tsgt.geometry.inertial_calibration.joint_solver import solve_jointly, states_of_imu
+from tsgt.geometry.inertial_calibration.joint_system import stamp_times
+from tsgt.geometry.inertial_calibration.setup import LATENCY, POSITION, ROTATION, ImuSetup, SetupPrior
+from tsgt.geometry.rigid import log_so3
+
+if TYPE_CHECKING:
+    from tsgt.geometry.inertial import Gravity, InertialSamples
+    from tsgt.geometry.inertial_calibration.alignment import Alignment, Products, Series
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory import Observations, States
+    from tsgt.model import ImuNoise
+
+Cause = Literal[
+    "unit_of_rate", "unit_of_force", "gravity_sign", "axes", "rotation", "position", "latency", "unrelated"
+]
+"""``unrelated``: rates that are not the robot's at all."""
+
+MIN_ROTATION_RAD = np.radians(0.5)
+MIN_POSITION_M = 0.05
+MIN_LATENCY_S = 0.004
+"""Errors below these harm little: a few tenths of a millimetre, a few hundredths of a degree."""
+
+MIN_SIGNIFICANCE = 5.0  # Sigmas, of three components together
+MIN_MEASUREMENTS = 60
+MATRIX_SIGMA = 3e-3  # Of the matrices beside what is configured
+MIN_RATE_FACTOR, MIN_FORCE_FACTOR = 2.0, 1.25
+MAX_AXES_ERROR_RAD = np.radians(15.0)
+MIN_GAIN = 25.0  # Half the decrease of the sum of squares by which other axes explain rates and forces better
+
+RIGHT_ANGLED = [
+    matrix
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+    if np.linalg.det(matrix := np.diag(signs)[:, order]) > 0
+]
+"""The 24 rotations that take axes to axes."""
+
+
+@dataclass(frozen=True, slots=True)
+class SetupFinding:
+    """Something that is wrong in the configuration of an IMU."""
+
+    cause: Cause
+    size: float  # In rad, m, s, or a factor
+    sigma: float  # One sigma of it; 0 where it is beyond doubt
+    text: str
+
+
+def check_imu_setup(
+    observations: Observations,
+    states: States,
+    samples: InertialSamples,
+    mounting: Mounting,
+    noise: ImuNoise,
+    gravity: Gravity,
+) -> list[SetupFinding]:
+    """Compare a configured IMU with a drive of up to a minute; no finding where the drive does not tell.
+
+    Takes a tenth of a second or two of computing.
+
+    Parameters
+    ----------
+    observations : In the order of time, with the layout in the axes of the robot.
+    states : Of the robot at the reference point of the layout, from the stations alone.
+    samples : Latency and gyro matrix as configured are applied.
+    mounting : As configured, from that reference point.
+    noise : Of the data sheet.
+    """
+    robot, imu = series_of_states(states, gravity), series_of_samples(samples)
+    if not turns(robot):
+        return []
+    units = _wrong_units(robot, imu, gravity)
+    if units:
+        return units
+    try:
+        alignment = align(robot, imu)
+    except GeometryError:
+        text = "the angular rates of the IMU are not those of the robot at any latency: it is another robot's"
+        return [SetupFinding("unrelated", 0.0, 0.0, text)]
+    products = products_at(robot, imu, alignment.latency_s)
+    gross = _wrong_axes(products, alignment.rotation, mounting.rotation)
+    if gross is not None:
+        return [gross]
+    return _estimated_errors(observations, states, samples, mounting, noise, gravity, alignment)
+
+
+def _wrong_units(robot: Series, imu: Series, gravity: Gravity) -> list[SetupFinding]:
+    """Find rates and forces that are all too large or too small."""
+    findings = []
+    turning, turned = (np.sqrt(np.var(each.rate[each.known], axis=0).sum()) for each in (robot, imu))
+    factor = float(turned / turning)
+    if not 1 / MIN_RATE_FACTOR < factor < MIN_RATE_FACTOR:
+        unit = " (degrees per second instead of radians)" if 0.7 < factor * np.pi / 180 < 1.4 else ""
+        text = f"the angular rates are {factor:.3g} times those of the robot: another unit{unit}"
+        findings.append(SetupFinding("unit_of_rate", factor, 0.0, text))
+    factor = float(np.median(np.linalg.norm(imu.force[imu.known], axis=1))) / gravity.magnitude_mps2
+    if not 1 / MIN_FORCE_FACTOR < factor < MIN_FORCE_FACTOR:
+        unit = " (g instead of m/s^2)" if 0.9 < factor * gravity.magnitude_mps2 < 1.1 else ""
+        text = f"the specific force is {factor:.3g} times gravity: another unit{unit}"
+        findings.append(SetupFinding("unit_of_force", factor, 0.0, text))
+    return findings
+
+
+def _wrong_axes(products: Products, aligned: FloatArray, configured: FloatArray) -> SetupFinding | None:
+    """Find forces of the wrong sign, left-handed axes, or axes in the wrong order."""
+
+    def agreement(rotation: FloatArray, sign: float = 1.0) -> float:
+        """Half the decrease of the sum of squares against no agreement."""
+        return float(np.vdot(rotation, products.rates + sign * products.forces))
+
+    inverted = nearest_rotation(products.rates - products.forces)
+    if agreement(inverted, -1.0) - agreement(aligned) > MIN_GAIN:
+        text = "the specific force has the wrong sign: at rest it must point up, against gravity"
+        return SetupFinding("gravity_sign", -1.0, 0.0, text)
+    total = products.rates + products.forces
+    if np.linalg.det(total) < 0 and np.linalg.svd(total, compute_uv=False)[2] > MIN_GAIN:
+        text = "the axes of the IMU are left-handed: two of them are exchanged, or one is inverted"
+        return SetupFinding("axes", 0.0, 0.0, text)
+    wrong = configured.T @ aligned  # Takes true axes of the IMU to those that the configuration means
+    nearest = max(RIGHT_ANGLED, key=lambda each: float(np.vdot(each, wrong)))
+    error_rad = float(np.linalg.norm(log_so3(nearest.T @ wrong)))
+    if np.trace(nearest) > 2 or error_rad > MAX_AXES_ERROR_RAD:
+        return None
+    if agreement(aligned) - agreement(configured) < MIN_GAIN:
+        return None
+    names = ", ".join(
+        f"its {'xyz'[column]} is the configured {'-' if nearest[row, column] < 0 else ''}{'xyz'[row]}"
+        for column in range(3)
+        for row in range(3)
+        if nearest[row, column]
+    )
+    size = float(np.linalg.norm(log_so3(nearest)))
+    return SetupFinding("axes", size, error_rad, f"the axes of the IMU are swapped: {names}")
+
+
+def _estimated_errors(
+    observations: Observations,
+    states: States,
+    samples: InertialSamples,
+    mounting: Mounting,
+    noise: ImuNoise,
+    gravity: Gravity,
+    alignment: Alignment,
+) -> list[SetupFinding]:
+    """Find errors of mounting and latency by joint estimation."""
+    filled = contiguous(samples, noise)
+    count = int(observations.station.max()) + 1
+    configured = ImuSetup.initial(mounting, 0.0, count)
+    start = replace(
+        configured, mounting=Mounting(alignment.rotation, mounting.position), latency_s=alignment.latency_s
+    )
+    stamps_s = stamp_times(observations, start)
+    measured = observations.select((stamps_s > filled.bounds_s[0]) & (stamps_s < filled.bounds_s[-1]))
+    if len(measured) < MIN_MEASUREMENTS:
+        return []
+    try:
+        solution = solve_jointly(
+            measured,
+            filled,
+            noise,
+            lambda times_s, setup: states_of_imu(states, times_s, setup, alignment.gyro_bias),
+            SetupPrior.wide(configured, MATRIX_SIGMA),
+            gravity,
+            start=start,
+        )
+    except GeometryError:
+        return []
+    error = solution.point.setup.local_coordinates_about(configured)
+    covariance = solution.factor.shared_covariance[TILT_DIM:, TILT_DIM:]
+    findings = []
+    for cause, rows, limit in (
+        ("rotation", ROTATION, MIN_ROTATION_RAD),
+        ("position", POSITION, MIN_POSITION_M),
+        ("latency", slice(LATENCY, LATENCY + 1), MIN_LATENCY_S),
+    ):
+        part, own = error[rows], covariance[rows, rows]
+        size = float(np.linalg.norm(part))
+        if size < limit or part @ np.linalg.solve(own, part) < MIN_SIGNIFICANCE**2:
+            continue
+        sigma = float(np.sqrt(part @ own @ part)) / size
+        findings.append(SetupFinding(cause, size, sigma, _describe(cause, part, sigma, mounting)))  # type: ignore[arg-type]
+    return findings
+
+
+def _describe(cause: str, error: FloatArray, sigma: float, mounting: Mounting) -> str:
+    if cause == "rotation":
+        x, y, z = np.degrees(mounting.rotation @ error)
+        size_deg, sigma_deg = np.degrees(np.linalg.norm(error)), np.degrees(sigma)
+        return (
+            f"the mounting of the IMU is wrong by {size_deg:.2f} deg (sigma {sigma_deg:.2f}): it is turned about the axes "
+            f"of the robot by {x:+.2f}, {y:+.2f}, {z:+.2f} deg more"
+        )
+    if cause == "position":
+        x, y, z = 1e3 * error
+        return (
+            f"the position of the IMU is wrong by {1e3 * np.linalg.norm(error):.0f} mm (sigma {1e3 * sigma:.0f}): it is "
+            f"{x:+.0f}, {y:+.0f}, {z:+.0f} mm farther along the axes of the robot"
+        )
+    return (
+        f"the latency of the IMU is wrong: its stamps are {1e3 * float(error[0]):+.1f} ms later than configured "
+        f"(sigma {1e3 * sigma:.1f})"
+    )

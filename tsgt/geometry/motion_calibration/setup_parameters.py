@@ -209,24 +209,26 @@ class SetupParameters:
         self, observations: Observations, linearised: LinearisedMeasurements, setup: Setup
     ) -> FloatArray:
         """(M, 3, G) Jacobian of the residuals, of observations with this set-up, by the parameters."""
-        jacobian = np.zeros((len(observations), 3, self.count))
-        each = np.arange(3)
-        by_displacement = by_displacements(linearised, self.pivot)
-        by_latency = -matvec(linearised.by_point, linearised.velocity_mps)
-        for i, station in enumerate(self.stations):
-            rows = np.flatnonzero(observations.station == station)
-            displaced = [*self.translations[i], *self.rotations[i]]
-            jacobian[np.ix_(rows, each, displaced)] = by_displacement[rows]
-            jacobian[rows, :, self.latencies[i]] = by_latency[rows]
-        by_instrument = by_instrument_errors(observations, linearised, setup)
-        for i, station in enumerate(self.measured):
-            rows = np.flatnonzero(observations.station == station)
-            jacobian[np.ix_(rows, each, self.instrument[i])] = by_instrument[rows]
-        by_prism = linearised.by_point @ linearised.rotation
-        for prism, columns in enumerate(self.prisms):
-            rows = np.flatnonzero(observations.prism == prism)
-            jacobian[np.ix_(rows, each, columns)] = by_prism[rows]
-        return jacobian
+        blocks = np.concatenate(
+            [
+                by_displacements(linearised, self.pivot),
+                -linearised.by_point @ linearised.velocity_mps[:, :, None],
+                by_instrument_errors(observations, linearised, setup),
+                linearised.by_point @ linearised.rotation,
+            ],
+            axis=2,
+        )
+        # Columns of the blocks; those of what is no parameter come last, and are dropped.
+        of_station = np.full((len(observations.frames), 11), self.count, np.intp)
+        of_station[self.stations] = np.concatenate(
+            [self.translations, self.rotations, self.latencies[:, None], of_station[self.stations, 7:]],
+            axis=1,
+        )
+        of_station[self.measured, 7:] = self.instrument
+        columns = np.concatenate([of_station[observations.station], self.prisms[observations.prism]], axis=1)
+        jacobian = np.zeros((len(observations), 3, self.count + 1))
+        np.put_along_axis(jacobian, columns[:, None], blocks, axis=2)
+        return jacobian[:, :, : self.count]
 
     def point_jacobian(self, points_m: FloatArray, velocities_mps: FloatArray, station: int) -> FloatArray:
         """(N, 3, G) displacement in frame ``station1`` of a station's measured points, (N, 3), at a given time."""

@@ -44,6 +44,7 @@ class Propagator:
         self._times_s = np.array(
             [prior.acceleration_correlation_time_s, prior.angular_acceleration_correlation_time_s]
         )
+        self._found: dict[float, tuple[States, FloatArray, FloatArray]] = {}
         self._variances = process_noise_scale * axis_sigmas(prior) ** 2
 
     def at(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
@@ -65,7 +66,15 @@ class Propagator:
         return self._propagated(time_s)[1]
 
     def _propagated(self, time_s: float) -> tuple[States, FloatArray, FloatArray]:
-        """State at a time, and the Jacobians of its error by that at the start and by the process noise."""
+        """State at a time, and the Jacobians of its error by that at the start and by the process noise.
+
+        Kept, for poses and their common covariance are asked for one after the other.
+        """
+        if time_s not in self._found:
+            self._found[time_s] = self._propagate(time_s)
+        return self._found[time_s]
+
+    def _propagate(self, time_s: float) -> tuple[States, FloatArray, FloatArray]:
         start, dt_s = self._start, time_s - self.time_s
         linear, angular = (acceleration_response(dt_s, float(each)) for each in self._times_s)
         magnus_s2 = dt_s * dt_s / 12

@@ -50,7 +50,16 @@ class States:
 
     def select(self, rows: slice | NDArray[np.intp]) -> States:
         """Return the states of some rows."""
-        return States(*(getattr(self, name)[rows] for name in States.__slots__))
+        # Not a loop over the fields: the live estimator selects a dozen times per measurement.
+        return States(
+            self.time_s[rows],
+            self.position[rows],
+            self.rotation[rows],
+            self.velocity[rows],
+            self.angular_velocity[rows],
+            self.acceleration[rows],
+            self.angular_acceleration[rows],
+        )
 
     def retract(self, error: FloatArray) -> States:
         """Add errors, (K, 18), to the states."""

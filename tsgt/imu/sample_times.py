@@ -11,6 +11,12 @@ from typing import NamedTuple
 
 _REMEMBERED = 512  # samples that are recognised when they are printed again
 
+_BASELINE = 1000  # samples after which the period is known to 1e-5 and better
+
+_GAP_TOLERANCE_NS = 2e6
+_GAP_TOLERANCE = 1e-4
+"""By how much the clock may disagree with the counter over a gap, plus this share of it; beyond, it was set meanwhile."""
+
 _MAX_STEPS = 1e7  # a count that is further ahead is not a gap of samples
 
 
@@ -41,10 +47,20 @@ class SampleTimes:
     def __init__(self, rate_hz: float) -> None:
         self._period_ns = 1e9 / rate_hz
         self._last: tuple[int | None, int | None] | None = None
+        self._origin: tuple[int, int] | None = (
+            None  # counter and clock of the first sample since the last restart
+        )
         self._recent: deque[tuple[int | None, int | None]] = deque(maxlen=_REMEMBERED)
 
     def push(self, counter: int | None, instrument_time_ns: int | None) -> SampleTime | None:
         """Take the next sample, with at least one of both; None for a recent sample once more."""
+        found = self._push(counter, instrument_time_ns)
+        if found is not None and found.restarted:
+            given = counter is not None and instrument_time_ns is not None
+            self._origin = (counter or 0, instrument_time_ns or 0) if given else None
+        return found
+
+    def _push(self, counter: int | None, instrument_time_ns: int | None) -> SampleTime | None:
         sample = (counter, instrument_time_ns)
         last = self._last
         if last is not None and _not_after(sample, last) and sample in self._recent:
@@ -69,12 +85,31 @@ class SampleTimes:
                 return restart
             if steps is None:
                 steps = max(1, round(span_ns / self._period_ns))
-            elif steps > 0 and not 0.5 < span_ns / (steps * self._period_ns) < 1.5:  # the clock was set
+            elif steps > 0 and (
+                not 0.5 < span_ns / (steps * self._period_ns) < 1.5
+                or (steps > 1 and self._set_in_gap(sample, last))
+            ):  # the clock was set
                 return restart
             duration_ns = round(span_ns / steps) if steps > 0 else period_ns
         if not 0 < steps <= _MAX_STEPS:
             return restart
         return SampleTime(end_ns, duration_ns, steps - 1, restarted=False)
+
+    def _set_in_gap(self, sample: tuple[int | None, int | None], last: tuple[int | None, int | None]) -> bool:
+        """Whether the clock was set during a gap: it disagrees with the counter times the period of the samples before.
+
+        A gap of ten seconds hides a step of one second from the nominal period. A clock that is set back in it would
+        look like samples that arrive late.
+        """
+        (counter, time_ns), (before, time_before_ns), origin = sample, last, self._origin
+        if counter is None or time_ns is None or before is None or time_before_ns is None or origin is None:
+            return False
+        count = before - origin[0]
+        if count < _BASELINE:
+            return False
+        expected_ns = (counter - before) * (time_before_ns - origin[1]) / count
+        error_ns = abs(time_ns - time_before_ns - expected_ns)
+        return error_ns > _GAP_TOLERANCE_NS + _GAP_TOLERANCE * expected_ns
 
 
 def _not_after(sample: tuple[int | None, int | None], last: tuple[int | None, int | None]) -> bool:

@@ -61,6 +61,19 @@ def test_steps_are_restarts(samples: tuple[tuple[int | None, int | None], ...]) 
     assert found.duration_ns == 5 * MS
 
 
+@pytest.mark.parametrize(("step_ns", "restarted"), [(0, False), (-1_500 * MS, True), (20 * MS, True)])
+def test_clock_set_in_a_gap(step_ns: int, restarted: bool) -> None:  # noqa: FBT001 (a parameter of the test)
+    """A step in a gap of 14 s shows against the counter, whose period is 1 % off the nominal one."""
+    period_ns = 5_050_000
+    times = SampleTimes(200.0)
+    for counter in range(1500):
+        times.push(counter, counter * period_ns)
+    found = times.push(4300, 4300 * period_ns + step_ns)
+    assert found is not None
+    assert found.restarted == restarted
+    assert found.lost == (0 if restarted else 2800)
+
+
 def test_repeated_sample_is_none() -> None:
     """The same counter and time."""
     assert pushed((1, 5 * MS), (1, 5 * MS)) == [None]

@@ -7,16 +7,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from harness.inertial_drive import imu_parameters, inertial_drive
+from harness.records import HEADER, SECOND, START
 
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.inertial import Gravity, Mounting
 from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
+from tsgt.model import ImuSamples, Parameters, PointMeasurement, PrismPosition, StationParameters
+from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import InertialSamples
     from tsgt.geometry.trajectory import Observations
     from tsgt.model import ImuParameters
 
+SAMPLES_PER_LINE = 100
 MATRIX_SIGMAS = {"industrial": 7e-4, "consumer": 7e-3}
 
 
@@ -28,6 +35,7 @@ class UncalibratedDrive:
     samples: InertialSamples  # at their stamps
     imu: ImuParameters
     truth: ImuSetup
+    centroid_m: FloatArray  # (3,) of the prisms in the robot frame
 
     @property
     def gravity(self) -> Gravity:
@@ -62,4 +70,49 @@ def uncalibrated_drive(
         2,
     )
     observations = replace(drive.measure(seed=seed), layout=drive.layout - centroid)
-    return UncalibratedDrive(observations, samples, imu, truth)
+    return UncalibratedDrive(observations, samples, imu, truth, centroid)
+
+
+def write_imu_recording(path: Path, drive: UncalibratedDrive) -> None:
+    """Write a recording of a drive, configured with an IMU at the robot's origin."""
+    observations, samples = drive.observations, drive.samples
+    imu = replace(drive.imu, position_m=(0.0, 0.0, 0.0), orientation_xyzw=(0.0, 0.0, 0.0, 1.0))
+    layout = observations.layout + drive.centroid_m
+    parameters = Parameters(
+        stations=tuple(StationParameters(station=number, prism=number) for number in (1, 2, 3)),
+        prisms=tuple(
+            PrismPosition(prism=number, position_m=tuple(position))  # type: ignore[arg-type]
+            for number, position in enumerate(layout.tolist(), start=1)
+        ),
+        imu=imu,
+    )
+    records: list[object] = [HEADER, parameters]
+    stamps_ns = START + np.round(1e9 * observations.time_s).astype(np.int64)
+    for number, (stamp_ns, prism, position) in enumerate(
+        zip(stamps_ns.tolist(), observations.prism.tolist(), observations.in_world().tolist(), strict=True)
+    ):
+        records.append(
+            PointMeasurement(
+                station=prism + 1,
+                prism=prism + 1,
+                sequence=number,
+                stamp_ns=stamp_ns,
+                received_ns=stamp_ns + SECOND // 5,
+                position_m=tuple(position),
+            )
+        )
+    end_ns = START + np.round(1e9 * samples.end_s).astype(np.int64)
+    for first in range(0, len(samples), SAMPLES_PER_LINE):
+        rows = slice(first, first + SAMPLES_PER_LINE)
+        records.append(
+            ImuSamples(
+                sequence=first,
+                received_ns=int(end_ns[rows][-1]),
+                stamp_ns=tuple(end_ns[rows].tolist()),
+                duration_ns=tuple(np.round(1e9 * samples.duration_s[rows]).astype(np.int64).tolist()),
+                instrument_time_ns=None,
+                angular_rate_radps=tuple(map(tuple, samples.angular_rate_radps[rows].tolist())),
+                specific_force_mps2=tuple(map(tuple, samples.specific_force_mps2[rows].tolist())),
+            )
+        )
+    path.write_bytes(b"".join(encode_line(record) + b"\n" for record in records))

@@ -27,11 +27,12 @@ def with_calibration(parameters: Parameters, calibration: StationCalibration, *,
         raise ConfigError(
             f"{path}: stations.{missing[0]}: missing; the recording has this station", path=path
         )
+    known = parameters.setup_covariance
     stations = tuple(calibration.stations[s.station].applied(s) for s in parameters.stations)
     return dataclasses.replace(
         parameters,
         stations=stations,
-        setup_covariance=_covariance(parameters, calibration.covariance, parameters.setup_covariance),
+        setup_covariance=_covariance(parameters, calibration.covariance, known, known),
     )
 
 
@@ -49,20 +50,25 @@ def with_layout(parameters: Parameters, layout: PrismLayout, *, path: Path) -> P
         check_layout([positions_m[number] for number in numbers], names=numbers)
     except DegenerateGeometryError as error:
         raise ConfigError(f"{path}: {error}", path=path, key="prisms") from error
+    known = parameters.setup_covariance
     prisms = tuple(PrismPosition(prism=number, position_m=positions_m[number]) for number in numbers)
     return dataclasses.replace(
         parameters,
         prisms=prisms,
-        setup_covariance=_covariance(parameters, parameters.setup_covariance, layout.covariance),
+        setup_covariance=_covariance(parameters, known, layout.covariance, known),
     )
 
 
 def _covariance(
-    parameters: Parameters, stations: SetupCovariance | None, prisms: SetupCovariance | None
+    parameters: Parameters,
+    stations: SetupCovariance | None,
+    prisms: SetupCovariance | None,
+    imu: SetupCovariance | None,
 ) -> SetupCovariance | None:
     return setup_covariance(
         stations,
         prisms,
         station_numbers=(s.station for s in parameters.stations),
         prism_numbers=(p.prism for p in parameters.prisms),
+        imu=imu,
     )

@@ -15,6 +15,7 @@ from tsgt.config import (
     KINDS,
     ClassicConfig,
     ClientConfig,
+    ImuMountingFile,
     MasterConfig,
     Model,
     PrismLayoutFile,
@@ -154,6 +155,8 @@ def _summary(content: Model) -> dict[str, Any]:
             return {"prisms": [int(number) for number in content.prisms]}
         case StationFramesFile():
             return {"stations": [int(number) for number in content.stations]}
+        case ImuMountingFile():
+            return {"position_m": content.position_m, "latency_ms": content.latency_ms}
     raise TypeError(f"no summary for {type(content).__name__}")
 
 

@@ -1,15 +1,17 @@
 """Configuration and set-up files: TOML in, validated models and parameters in SI units out.
 
-The top-level key ``kind`` of a file selects its model: ``client``, ``master``, ``station_frames``, ``prism_layout`` or
-``scenario``. A path in a file is relative to the folder of that file. ``files`` reads, the models validate,
+The top-level key ``kind`` of a file selects its model: ``client``, ``master``, ``station_frames``, ``prism_layout``,
+``imu_mounting`` or ``scenario``. A path in a file is relative to the folder of that file. ``files`` reads, the models validate,
 ``parameters`` converts, ``permissions`` rejects files that everybody can change.
 """
 
 from tsgt.config.base import Model, NoiseConfig
 from tsgt.config.calibration import (
+    ImuMounting,
     PrismLayout,
     StationCalibration,
     StationSetup,
+    load_imu_mounting,
     load_prism_layout,
     load_station_calibration,
     setup_covariance,
@@ -67,7 +69,7 @@ from tsgt.config.scenario import (
     SimulatedStation,
 )
 from tsgt.config.scenario_imu import ImuModelName, ImuSetupErrorConfig, ShakingConfig, SimulatedImu
-from tsgt.config.setup import PrismLayoutFile, StationFramesFile
+from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, StationFramesFile
 
 __all__ = [
     "IMU_NOISE",
@@ -83,6 +85,8 @@ __all__ = [
     "HardwareRadioConfig",
     "ImuConfig",
     "ImuModelName",
+    "ImuMounting",
+    "ImuMountingFile",
     "ImuNoiseConfig",
     "ImuSetupErrorConfig",
     "InstrumentConfig",
@@ -126,6 +130,7 @@ __all__ = [
     "level_frame",
     "load",
     "load_any",
+    "load_imu_mounting",
     "load_prism_layout",
     "load_station_calibration",
     "noise",

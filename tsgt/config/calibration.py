@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tsgt.config.files import load
-from tsgt.config.setup import PrismLayoutFile, StationFramesFile
+from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, StationFramesFile
 from tsgt.model import SetupCovariance, TargetResidual
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.config.setup import CovarianceTable, StationFrame
-    from tsgt.model import Matrix4, StationParameters, Vector3
+    from tsgt.model import ImuParameters, Matrix4, Row4, StationParameters, Vector3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +58,27 @@ class PrismLayout:
     covariance: SetupCovariance | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuMounting:
+    """Calibration of the robot's IMU."""
+
+    position_m: Vector3  # in the robot frame
+    orientation_xyzw: Row4
+    latency_ns: int
+    gyro_matrix: tuple[Vector3, Vector3, Vector3]
+    covariance: SetupCovariance | None = None  # None: unknown
+
+    def applied(self, imu: ImuParameters) -> ImuParameters:
+        """Return the IMU's parameters with this calibration."""
+        return dataclasses.replace(
+            imu,
+            position_m=self.position_m,
+            orientation_xyzw=self.orientation_xyzw,
+            latency_ns=self.latency_ns,
+            gyro_matrix=self.gyro_matrix,
+        )
+
+
 def load_station_calibration(path: Path) -> StationCalibration:
     """Read a file of station frames; raises as :func:`tsgt.config.load`."""
     file = load(path, StationFramesFile)
@@ -82,24 +103,39 @@ def load_prism_layout(path: Path) -> PrismLayout:
     return PrismLayout({int(number): entry.position_m for number, entry in file.prisms.items()}, covariance)
 
 
+def load_imu_mounting(path: Path) -> ImuMounting:
+    """Read the mounting of an IMU; raises as :func:`tsgt.config.load`."""
+    file = load(path, ImuMountingFile)
+    return ImuMounting(
+        position_m=file.position_m,
+        orientation_xyzw=file.orientation_xyzw,
+        latency_ns=round(file.latency_ms * 1e6),
+        gyro_matrix=file.gyro_matrix,
+        covariance=_covariance(file.covariance),
+    )
+
+
 def setup_covariance(
     stations: SetupCovariance | None,
     prisms: SetupCovariance | None,
     *,
     station_numbers: Iterable[int],
     prism_numbers: Iterable[int],
+    imu: SetupCovariance | None = None,
 ) -> SetupCovariance | None:
-    """Join the stations' components of one covariance and the prisms' of another, for these stations and prisms.
+    """Join the stations' components of one covariance, the prisms' of another and the IMU's, for these stations and prisms.
 
-    None: both are unknown. Of one that is unknown no component is in the result: it is taken as exact.
+    None: those of stations and prisms are unknown. Of one that is unknown no component is in the result: it is taken as exact.
     """
     parts = [
         _restricted(stations, {f"station{number}" for number in station_numbers}),
         _restricted(prisms, {f"prism{number}" for number in prism_numbers}),
     ]
     known = [part for part in parts if part is not None]
-    if not known:
+    if not known:  # The IMU's alone would say that the others are exact
         return None
+    of_imu = _restricted(imu, {"imu"})
+    known += [] if of_imu is None else [of_imu]
     components = [name for part in known for name in part.components]
     rows: list[tuple[float, ...]] = []
     before = 0

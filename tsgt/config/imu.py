@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from tsgt.config.base import Model, Place, Positive
+from tsgt.config.base import Model, Place, Positive, RelativePath
 from tsgt.model import ImuNoise, ImuParameters, Row4, Vector3
 
 _G = 9.80665
@@ -34,6 +34,8 @@ IMU_NOISE: dict[str, ImuNoise] = {
     ),
 }
 """Noise of two classes of IMUs."""
+
+_MOUNTING_KEYS = ("position_m", "orientation_xyzw", "latency_ms", "gyro_matrix")
 
 Density = Annotated[float, Field(gt=0, le=1e3)] | None
 
@@ -78,14 +80,17 @@ class ImuConfig(Model):
     """Program that reads the IMU, with its arguments; see the reference of its lines. An absolute path in the field."""
     name: str = "imu"
     """Name of the IMU's frame."""
-    position_m: Place
-    """Origin of its axes in the robot frame, [x, y, z]."""
-    orientation_xyzw: Row4
+    mounting: RelativePath | None = None
+    """File of kind ``imu_mounting``, written by ``tsgt calibrate imu``, instead of the next four keys."""
+    position_m: Place | None = None
+    """Origin of its axes in the robot frame, [x, y, z]. For the drive that calibrates it any will do."""
+    orientation_xyzw: Row4 | None = None
     """Unit quaternion [x, y, z, w] that rotates coordinates in its axes into the robot frame."""
-    latency_ms: Annotated[float, Field(ge=-10_000, le=10_000)] = 0.0
-    """Latency from a sample to its timestamp, subtracted from it. Positive: the timestamp is late."""
-    gyro_matrix: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    """Scale factors and misalignment of the gyro: the angular rate is this matrix times the sample, less the bias."""
+    latency_ms: Annotated[float, Field(ge=-10_000, le=10_000)] | None = None
+    """Latency from a sample to its timestamp, subtracted from it. Positive: the timestamp is late; default 0."""
+    gyro_matrix: tuple[Vector3, Vector3, Vector3] | None = None
+    """Scale factors and misalignment of the gyro: the angular rate is this matrix times the sample, less the bias; default: the
+    identity."""
     noise: ImuNoiseConfig = ImuNoiseConfig()
     """Noise of the samples."""
     gravity_mps2: Annotated[float, Field(ge=9.7, le=9.9)] | None = None
@@ -103,20 +108,28 @@ class ImuConfig(Model):
     def _possible(self) -> ImuConfig:
         if (self.gravity_mps2 is None) == (self.latitude_deg is None):
             raise ValueError("give either gravity_mps2 or latitude_deg")
+        given = [name for name in _MOUNTING_KEYS if getattr(self, name) is not None]
+        if self.mounting is not None and given:
+            raise ValueError(f"give either mounting or {given[0]}")
+        if self.mounting is None and not {"position_m", "orientation_xyzw"} <= set(given):
+            raise ValueError("give either mounting, or position_m and orientation_xyzw")
         self.parameters()
         return self
 
     def parameters(self) -> ImuParameters:
-        """Return the parameters in SI units. Raises ValueError if there are none such."""
+        """Return the parameters in SI units, at the robot's origin if a file has the mounting.
+
+        Raises ValueError if there are none such.
+        """
         gravity = self.gravity_mps2
         if gravity is None:
             gravity = normal_gravity_mps2(self.latitude_deg or 0.0, self.height_m)
         return ImuParameters(
             name=self.name,
-            position_m=self.position_m,
-            orientation_xyzw=self.orientation_xyzw,
-            latency_ns=round(self.latency_ms * 1e6),
-            gyro_matrix=self.gyro_matrix,
+            position_m=self.position_m or (0.0, 0.0, 0.0),
+            orientation_xyzw=self.orientation_xyzw or (0.0, 0.0, 0.0, 1.0),
+            latency_ns=round((self.latency_ms or 0.0) * 1e6),
+            gyro_matrix=self.gyro_matrix or ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
             noise=self.noise.noise(),
             gravity_mps2=gravity,
             tilt_sigma_rad=self.tilt_sigma_mrad / 1e3,

@@ -5,7 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from tsgt.config.calibration import load_prism_layout, load_station_calibration, setup_covariance
+from tsgt.config.calibration import (
+    load_imu_mounting,
+    load_prism_layout,
+    load_station_calibration,
+    setup_covariance,
+)
 from tsgt.errors import ConfigError
 from tsgt.model import (
     ARCSECOND_RAD,
@@ -56,6 +61,10 @@ def parameters(config: MasterConfig) -> Parameters:
             path=config.setup.prism_layout,
             key="prisms",
         )
+    mounting = (
+        None if config.imu is None or config.imu.mounting is None else load_imu_mounting(config.imu.mounting)
+    )
+    imu = None if config.imu is None else config.imu.parameters()
     return Parameters(
         stations=tuple(
             calibration.stations[station.station].applied(
@@ -79,8 +88,9 @@ def parameters(config: MasterConfig) -> Parameters:
             prism_layout.covariance,
             station_numbers=(station.station for station in config.stations),
             prism_numbers=tracked,
+            imu=None if mounting is None else mounting.covariance,
         ),
-        imu=None if config.imu is None else config.imu.parameters(),
+        imu=imu if imu is None or mounting is None else mounting.applied(imu),
     )
 
 

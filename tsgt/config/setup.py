@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.base import Model, NotNegative, Number, NumberKey, Place, rigid
-from tsgt.model import Matrix4, SetupCovariance
+from tsgt.model import Matrix4, Row4, SetupCovariance, Vector3
 
 InstrumentErrorMrad = Annotated[float, Field(ge=-100, le=100)]
+
+_UNIT_TOLERANCE = 1e-6
 
 _STATION_COMPONENT = re.compile(
     r"station([1-9][0-9]{0,8})\."
     r"(x|y|z|rotation_[xyz]|latency|vertical_index|collimation|prism_constant|range_scale)"
 )
+_IMU_COMPONENT = re.compile(r"(imu)\.(x|y|z|rotation_[xyz]|latency|gyro_[1-3][1-3])")
 _PRISM_COMPONENT = re.compile(r"prism([1-9][0-9]{0,8})\.[xyz]")
 
 
@@ -25,7 +29,9 @@ class CovarianceTable(Model):
     components: tuple[str, ...]
     """Quantity of each row and column: `station2.x`, `.y`, `.z` (origin in the frame of station 1, m), `.rotation_x`,
     `.rotation_y`, `.rotation_z` (about the axes of station 1, rad), `.latency` (s), `.vertical_index`, `.collimation`
-    (rad), `.range_scale` (1), `.prism_constant` (m); `prism1.x`, `.y`, `.z` (in the robot frame, m)."""
+    (rad), `.range_scale` (1), `.prism_constant` (m); `prism1.x`, `.y`, `.z` (in the robot frame, m); `imu.x`,
+    `.y`, `.z` (m), `.rotation_x`, `.rotation_y`, `.rotation_z` (about the axes of the robot, rad), `.latency` (s), `.gyro_11` to
+    `.gyro_33` (1)."""
     matrix: tuple[tuple[float, ...], ...]
     """Covariances, row by row, in products of those units."""
 
@@ -111,4 +117,28 @@ class PrismLayoutFile(Model):
     @model_validator(mode="after")
     def _covariance_is_of_prisms(self) -> PrismLayoutFile:
         _check_components(self.covariance, _PRISM_COMPONENT, set(self.prisms))
+        return self
+
+
+class ImuMountingFile(Model):
+    """Mounting, latency and gyro matrix of the robot's IMU, written by ``tsgt calibrate imu``."""
+
+    kind: Literal["imu_mounting"]
+    """Kind of this file."""
+    position_m: Place
+    """Origin of its axes in the robot frame, [x, y, z]."""
+    orientation_xyzw: Row4
+    """Unit quaternion [x, y, z, w] that rotates coordinates in its axes into the robot frame."""
+    latency_ms: Annotated[float, Field(ge=-10_000, le=10_000)]
+    """Latency from a sample to its timestamp, subtracted from it. Positive: the timestamp is late."""
+    gyro_matrix: tuple[Vector3, Vector3, Vector3]
+    """Scale factors and misalignment of the gyro: the angular rate is this matrix times the sample, less the bias."""
+    covariance: CovarianceTable | None = None
+    """Joint uncertainty of all these; none: unknown."""
+
+    @model_validator(mode="after")
+    def _possible(self) -> ImuMountingFile:
+        _check_components(self.covariance, _IMU_COMPONENT, {"imu"})
+        if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < _UNIT_TOLERANCE:
+            raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
         return self

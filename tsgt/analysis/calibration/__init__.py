@@ -1,10 +1,11 @@
-"""Calibration from field files and recordings: station frames and prisms from targets, the whole set-up from motion.
+"""Calibration from field files and recordings: station frames and prisms from targets, the whole set-up and the IMU from motion.
 
 Comes in: target and prism files, a recording, the state of a target collection. Goes out: frames, prism positions and
 latencies with residuals, a check whether a station has moved, the next target to measure. The solvers are in
-``tsgt.geometry.target_calibration`` and ``tsgt.geometry.motion_calibration``.
+``tsgt.geometry``: ``target_calibration``, ``motion_calibration`` and ``inertial_calibration``.
 """
 
+from tsgt.analysis.calibration.imu import CalibratedImu, calibrate_recorded_imu
 from tsgt.analysis.calibration.motion import CalibratedRecording, HeldOutComparison, calibrate_recording
 from tsgt.analysis.calibration.station_check import StationCheck, check_station
 from tsgt.analysis.calibration.target_collection import StationTarget, TargetCollection
@@ -20,6 +21,7 @@ from tsgt.analysis.calibration.targets import (
 )
 
 __all__ = [
+    "CalibratedImu",
     "CalibratedRecording",
     "Exclusion",
     "HeldOutComparison",
@@ -27,6 +29,7 @@ __all__ = [
     "StationTarget",
     "TargetCalibration",
     "TargetCollection",
+    "calibrate_recorded_imu",
     "calibrate_recording",
     "check_station",
     "layout_covariance",

@@ -12,7 +12,12 @@ from tsgt.analysis.formats.odometry import read_stationary_intervals
 from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, tracked_prisms
 from tsgt.analysis.formats.rtklib import QUALITIES, SECOND_NS, PosFile, TimeSystem, read_pos
 from tsgt.analysis.formats.rts_files import PublishedTrack, read_prisms, read_tracks
-from tsgt.analysis.formats.setup_files import InstrumentErrors, write_prism_layout, write_station_frames
+from tsgt.analysis.formats.setup_files import (
+    InstrumentErrors,
+    write_imu_mounting,
+    write_prism_layout,
+    write_station_frames,
+)
 from tsgt.analysis.formats.target_file import (
     PrismFile,
     TargetFile,
@@ -52,6 +57,7 @@ __all__ = [
     "tum_lines",
     "valid_records",
     "valid_rows",
+    "write_imu_mounting",
     "write_mcap",
     "write_prism_layout",
     "write_station_frames",

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.geometry import FloatArray
-    from tsgt.model import SetupCovariance, TargetResidual
+    from tsgt.model import ImuParameters, SetupCovariance, TargetResidual
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,6 +95,18 @@ def write_prism_layout(
         for prism, position in sorted(positions_m.items())
     }
     _write(path, {"kind": "prism_layout", "prisms": tables}, covariance, comment)
+
+
+def write_imu_mounting(path: Path, imu: ImuParameters, *, comment: str, covariance: SetupCovariance) -> None:
+    """Write a file of kind ``imu_mounting``, atomically. Raises OutputFileError if the file cannot be written."""
+    content = {
+        "kind": "imu_mounting",
+        "position_m": list(imu.position_m),
+        "orientation_xyzw": list(imu.orientation_xyzw),
+        "latency_ms": imu.latency_ns / 1e6,
+        "gyro_matrix": [list(row) for row in imu.gyro_matrix],
+    }
+    _write(path, content, covariance, comment)
 
 
 def _covariance_table(covariance: SetupCovariance) -> str:

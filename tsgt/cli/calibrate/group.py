@@ -22,6 +22,7 @@ from tsgt.cli.calibrate.frame_output import (
     target_constant_option,
     weak_text,
 )
+from tsgt.cli.calibrate.imu import imu
 from tsgt.cli.calibrate.motion import motion
 from tsgt.cli.calibrate.targets import targets
 from tsgt.cli.options import constant_m, constant_option, json_option
@@ -40,11 +41,12 @@ PRISM_CONSTANT = "--prism-constant-mm"
 
 @click.group()
 def calibrate() -> None:
-    """Solve station frames, prism layout and latencies."""
+    """Solve station frames, prism layout, latencies and the mounting of the IMU."""
 
 
 calibrate.add_command(collect)
 calibrate.add_command(check)
+calibrate.add_command(imu)
 calibrate.add_command(motion)
 calibrate.add_command(targets)
 

@@ -6,6 +6,11 @@ causes of a set-up that contradicts the data. docs/explanation/imu.md derives th
 
 from tsgt.geometry.inertial_calibration.alignment import Alignment, align, series_of_samples, series_of_states
 from tsgt.geometry.inertial_calibration.calibration import ImuCalibration, calibrate_imu
+from tsgt.geometry.inertial_calibration.observability import (
+    SetupComponent,
+    robot_covariance,
+    setup_components,
+)
 from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_main_axes
 from tsgt.geometry.inertial_calibration.setup_check import SetupFinding, check_imu_setup
 
@@ -13,12 +18,15 @@ __all__ = [
     "Alignment",
     "ImuCalibration",
     "ImuSetup",
+    "SetupComponent",
     "SetupFinding",
     "SetupPrior",
     "align",
     "calibrate_imu",
     "check_imu_setup",
     "in_main_axes",
+    "robot_covariance",
     "series_of_samples",
     "series_of_states",
+    "setup_components",
 ]

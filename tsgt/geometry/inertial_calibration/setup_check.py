@@ -6,6 +6,7 @@ calibration, and compared with the configured one: a cause is named if it is sig
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 from typing import TYPE_CHECKING, Literal
@@ -40,7 +41,7 @@ Cause = Literal[
 ]
 """``unrelated``: rates that are not the robot's at all."""
 
-MIN_ROTATION_RAD = np.radians(0.5)
+MIN_ROTATION_RAD = math.radians(0.5)
 MIN_POSITION_M = 0.05
 MIN_LATENCY_S = 0.004
 """Errors below these harm little: a few tenths of a millimetre, a few hundredths of a degree."""
@@ -49,7 +50,7 @@ MIN_SIGNIFICANCE = 5.0  # Sigmas, of three components together
 MIN_MEASUREMENTS = 60
 MATRIX_SIGMA = 3e-3  # Of the matrices beside what is configured
 MIN_RATE_FACTOR, MIN_FORCE_FACTOR = 2.0, 1.25
-MAX_AXES_ERROR_RAD = np.radians(15.0)
+MAX_AXES_ERROR_RAD = math.radians(15.0)
 MIN_GAIN = 25.0  # Half the decrease of the sum of squares by which other axes explain rates and forces better
 
 RIGHT_ANGLED = [

@@ -1,0 +1,153 @@
+"""The command ``tsgt calibrate imu``: mounting, latency and gyro matrix of the robot's IMU from motion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from tsgt.analysis.calibration import calibrate_recorded_imu
+from tsgt.analysis.formats import write_imu_mounting
+from tsgt.cli.options import OutputFile, json_option, keep_going_option, recording_argument
+from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
+from tsgt.cli.progress import progress
+from tsgt.geometry import log_so3, rotation_from_quaternion
+from tsgt.geometry.inertial_calibration import setup_components
+from tsgt.recording import load_recording, read_imu_samples
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.analysis.calibration import CalibratedImu
+    from tsgt.geometry import FloatArray
+    from tsgt.model import ImuParameters
+
+
+@click.command()
+@recording_argument
+@click.option(
+    "--output", type=OutputFile(".toml"), help="File of mounting, latency and gyro matrix to write (.toml)."
+)
+@keep_going_option
+@json_option
+def imu(*, recording: Path, output: Path | None, keep_going: bool, as_json: bool) -> int:
+    """Calibrate the robot's IMU from motion.
+
+    Finds mounting, position, latency and gyro matrix from two to five minutes of driving curves, slopes and bumps,
+    without an initial guess. What the drive leaves undetermined is named. Exit code 3: the parts of the drive
+    contradict each other, or the measurements the samples; the file is not written.
+    """
+    refuse_overwrite([recording], output)
+    with progress("calibrating") as on_progress:
+        found = calibrate_recorded_imu(
+            load_recording(recording, keep_going=keep_going, on_problem=report_problem),
+            # Problems of the file have been reported.
+            read_imu_samples(recording, keep_going=keep_going),
+            on_progress=on_progress,
+        )
+    if as_json:
+        print_json(_json(found))
+    else:
+        _print(found)
+    for component in setup_components(found.calibration):
+        if not component.determined:
+            click.echo(f"note: {component.name}: undetermined by this drive; {component.advice}", err=True)
+    failed = found.failed_checks()
+    for reason in failed:
+        click.echo(f"check failed: {reason}", err=True)
+    if output is not None and not failed:
+        write_imu_mounting(
+            output,
+            found.parameters,
+            comment=f"written by tsgt calibrate imu {recording}",
+            covariance=found.covariance,
+        )
+        click.echo(f"{output}: mounting of the IMU with its covariance written", err=True)
+    elif output is not None:
+        click.echo(f"{output} is not written", err=True)
+    return CHECK_FAILED if failed else 0
+
+
+def _rotation_deg(imu: ImuParameters) -> FloatArray:
+    """(3,) rotation vector from the robot's axes to the IMU's, about the axes of the robot."""
+    vector: FloatArray = np.degrees(log_so3(rotation_from_quaternion(np.array(imu.orientation_xyzw))))
+    return vector
+
+
+def _sigmas(found: CalibratedImu) -> FloatArray:
+    """(7,) of position in mm, rotation in deg and latency in ms."""
+    variances = np.diag(np.array(found.covariance.matrix))[:7]
+    sigmas: FloatArray = np.sqrt(variances) * np.array([1e3] * 3 + [180 / np.pi] * 3 + [1e3])
+    return sigmas
+
+
+def _json(found: CalibratedImu) -> dict[str, Any]:
+    calibration, parameters = found.calibration, found.parameters
+    sigmas = _sigmas(found)
+    matrix_sigma = np.sqrt(np.diag(np.array(found.covariance.matrix)))[7:].reshape(3, 3)
+    return {
+        "rotation_deg": _rotation_deg(parameters).tolist(),
+        "rotation_deg_sigma": sigmas[3:6].tolist(),
+        "orientation_xyzw": list(parameters.orientation_xyzw),
+        "lever_arm_mm": [1e3 * each for each in parameters.position_m],
+        "lever_arm_mm_sigma": sigmas[0:3].tolist(),
+        "offset_ms": parameters.latency_ns / 1e6,
+        "offset_ms_sigma": float(sigmas[6]),
+        "gyro_matrix": [list(row) for row in parameters.gyro_matrix],
+        "gyro_matrix_sigma": matrix_sigma.tolist(),
+        "matrix_prior_sigma": calibration.matrix_sigma,
+        "log_bayes_factor": calibration.log_bayes_factor,
+        "observability": [
+            {
+                "name": each.name,
+                "sigma": each.sigma,
+                "prior_sigma": each.prior_sigma,
+                "determined": each.determined,
+            }
+            for each in setup_components(calibration)
+        ],
+        "rate_correlation": calibration.alignment.correlation,
+        "duration_s": calibration.duration_s,
+        "measurements": calibration.measurements,
+        "outliers": calibration.outliers,
+        "noise_scale": calibration.noise_scale,
+        "disagreement": calibration.birge_ratio,
+        "failed": found.failed_checks(),
+    }
+
+
+def _print(found: CalibratedImu) -> None:
+    calibration, parameters, configured = found.calibration, found.parameters, found.configured
+    kind = "calibrated in the factory" if calibration.log_bayes_factor < 0 else "uncalibrated"
+    click.echo(
+        f"{calibration.duration_s:.0f} s, {calibration.measurements} measurements, {calibration.outliers} outliers, "
+        f"noise scale {calibration.noise_scale:.2f}; sigmas scaled by {calibration.birge_ratio:.2f} (Birge ratio of parts of "
+        f"the drive); gyro and accelerometer: {kind} (log Bayes factor {calibration.log_bayes_factor:+.0f})"
+    )
+    sigmas = _sigmas(found)
+    values, before = _rotation_deg(parameters), _rotation_deg(configured)
+    rows = [
+        [f"rotation {axis}, deg", f"{values[i]:.3f}", f"{sigmas[3 + i]:.3f}", f"{before[i]:.3f}"]
+        for i, axis in enumerate("xyz")
+    ]
+    rows += [
+        [
+            f"position {axis}, mm",
+            f"{1e3 * parameters.position_m[i]:.1f}",
+            f"{sigmas[i]:.1f}",
+            f"{1e3 * configured.position_m[i]:.1f}",
+        ]
+        for i, axis in enumerate("xyz")
+    ]
+    latencies = [f"{each.latency_ns / 1e6:.2f}" for each in (parameters, configured)]
+    rows.append(["latency, ms", latencies[0], f"{sigmas[6]:.2f}", latencies[1]])
+    print_table(["robot frame", "value", "sigma", "configured"], rows)
+    click.echo()
+    print_table(
+        ["gyro matrix", "x", "y", "z"],
+        [
+            [axis, *(f"{value:.5f}" for value in row)]
+            for axis, row in zip("xyz", parameters.gyro_matrix, strict=True)
+        ],
+    )

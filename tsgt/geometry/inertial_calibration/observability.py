@@ -1,0 +1,99 @@
+"""What a drive has told of an IMU's set-up, component by component, and what it has left to the prior. Sans-I/O."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.inertial_calibration.calibration import UNCALIBRATED
+from tsgt.geometry.inertial_calibration.setup import (
+    GYRO_MATRIX,
+    LATENCY,
+    POSITION,
+    ROTATION,
+    gyro_directions,
+)
+
+if TYPE_CHECKING:
+    from tsgt.geometry.inertial_calibration.calibration import ImuCalibration
+    from tsgt.geometry.rigid import FloatArray
+
+ROTATION_LIMIT_RAD = math.radians(0.15)
+POSITION_LIMIT_M = 0.01
+LATENCY_LIMIT_S = 0.001
+"""One sigma beyond which a component counts as undetermined: more harms the poses."""
+
+MAX_SHARE_OF_PRIOR = 0.5  # Of the sigma of a component of the gyro matrix
+
+_ADVICE = {
+    "rotation": "accelerate, brake and turn more",
+    "position": "turn on the spot and, for its height, drive over slopes and bumps",
+    "latency": "change speed and direction more often",
+    "gyro": "drive over slopes and bumps, so that the robot rolls and pitches",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SetupComponent:
+    """One component of the set-up."""
+
+    name: str
+    sigma: float  # rad, m, s, or 1
+    prior_sigma: float
+    determined: bool
+    advice: str  # What to drive if it is not determined
+
+
+def setup_components(calibration: ImuCalibration) -> list[SetupComponent]:
+    """Components of rotation and position along the axes of the robot, latency, and gyro matrix."""
+    sigmas, prior = calibration.sigmas, calibration.prior.sigmas
+    rotation = calibration.setup.mounting.rotation
+    about_robot = rotation @ calibration.covariance[ROTATION, ROTATION] @ rotation.T
+    found = []
+    for kind, words, values, priors, limit in (
+        ("rotation", "rotation about", np.sqrt(np.diag(about_robot)), prior[ROTATION], ROTATION_LIMIT_RAD),
+        ("position", "position along", sigmas[POSITION], prior[POSITION], POSITION_LIMIT_M),
+    ):
+        for axis, value, before in zip("xyz", values.tolist(), priors.tolist(), strict=True):
+            found.append(
+                SetupComponent(f"{words} the robot's {axis}", value, before, value < limit, _ADVICE[kind])
+            )
+    latency_s = float(sigmas[LATENCY])
+    found.append(
+        SetupComponent(
+            "latency", latency_s, float(prior[LATENCY]), latency_s < LATENCY_LIMIT_S, _ADVICE["latency"]
+        )
+    )
+    # What the factory has calibrated needs no motion.
+    trusted = calibration.matrix_sigma < UNCALIBRATED
+    names = _matrix_names(calibration.setup.main_axis)
+    for name, value, before in zip(
+        names, sigmas[GYRO_MATRIX].tolist(), prior[GYRO_MATRIX].tolist(), strict=True
+    ):
+        determined = trusted or value < MAX_SHARE_OF_PRIOR * before
+        found.append(SetupComponent(name, value, before, determined, _ADVICE["gyro"]))
+    return found
+
+
+def _matrix_names(main_axis: int) -> list[str]:
+    i, j = (axis for axis in range(3) if axis != main_axis)
+    pairs = [(i, j), (main_axis, i), (main_axis, j)]
+    return [
+        *(f"scale of the gyro's {axis}" for axis in "xyz"),
+        *(f"misalignment of the gyro's {'xyz'[a]} and {'xyz'[b]}" for a, b in pairs),
+    ]
+
+
+def robot_covariance(calibration: ImuCalibration) -> FloatArray:
+    """(16, 16) of position (robot frame), rotation (about the axes of the robot), latency, and gyro matrix, row by row."""
+    setup = calibration.setup
+    jacobian = np.zeros((16, setup.dim))
+    jacobian[0:3, POSITION] = np.eye(3)
+    jacobian[3:6, ROTATION] = setup.mounting.rotation
+    jacobian[6, LATENCY] = 1.0
+    jacobian[7:16, GYRO_MATRIX] = gyro_directions(setup.main_axis).reshape(6, 9).T
+    covariance = jacobian @ calibration.covariance @ jacobian.T
+    return np.asarray(0.5 * (covariance + covariance.T))

@@ -20,7 +20,10 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
     "Field": {
         "doctor": ("doctor:doctor", "Check that this machine is ready for the field."),
         "config": ("config:config", "Check configuration and set-up files."),
-        "calibrate": ("calibrate.group:calibrate", "Solve station frames, prism layout and latencies."),
+        "calibrate": (
+            "calibrate.group:calibrate",
+            "Calibrate station frames, prism layout, latencies and IMU.",
+        ),
         "status": ("status:status", "Show the status of the daemon on this machine."),
         "listen": ("live:listen", "Print the pose stream as text."),
         "imu": ("imu:imu", "Read an IMU for the master."),

@@ -41,7 +41,7 @@ PRISM_CONSTANT = "--prism-constant-mm"
 
 @click.group()
 def calibrate() -> None:
-    """Solve station frames, prism layout, latencies and the mounting of the IMU."""
+    """Calibrate station frames, prism layout, latencies and IMU."""
 
 
 calibrate.add_command(collect)

@@ -1,0 +1,131 @@
+"""Accuracy of `tsgt calibrate imu`: simulated missions with an unknown mounting, latency and device each.
+
+    python benchmarks/run.py imu_calibration industrial|consumer [--seeds 40] [--first 0] [--duration 300] [--scenario dynamic]
+
+Each mission has a device of its own, mounted anywhere in any orientation, and a latency of up to 50 ms; the robot is shaken
+while it drives. Prints, per mission, the errors of rotation (deg), position (mm, the largest of x and y, and z) and latency
+(ms), the same in stated sigmas (rotation and position: the largest component), and over all missions the rms, the largest
+error, the share within two sigmas, and chi-square per component of rotation, position and latency together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tsgt.analysis.calibration import calibrate_recorded_imu
+from tsgt.config import SimulatedImu, SuperframeMasterConfig
+from tsgt.geometry import log_so3, rotation_from_quaternion
+from tsgt.geometry.inertial_calibration import in_main_axes
+from tsgt.log import configure_logging
+from tsgt.recording import load_recording, read_imu_samples
+from tsgt.simulation.options import SimulationOptions
+from tsgt.simulation.runner import simulate
+from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from tsgt.config import ScenarioConfig
+    from tsgt.geometry import FloatArray
+
+LIMITS = {"rotation": 0.08, "horizontal": 4.0, "vertical": 7.0, "latency": 0.6}
+
+
+def scenario_with_imu(name: str, model: str, seed: int) -> ScenarioConfig:
+    """Return a scenario with a device, a mounting and a latency of the seed's."""
+    rng = np.random.default_rng([seed, 7])
+    quaternion = np.round(Rotation.random(random_state=rng.integers(2**31)).as_quat(), 5)
+    imu = SimulatedImu.model_validate(
+        {
+            "model": model,
+            "serial_number": seed,
+            "position_m": tuple(np.round(rng.uniform([-0.5, -0.5, 0.0], [0.5, 0.5, 1.0]), 4).tolist()),
+            "orientation_xyzw": tuple(quaternion.tolist()),
+            "latency_ms": float(np.round(rng.uniform(0.0, 50.0), 3)),
+        }
+    )
+    scenario = find_scenario(name)
+    # The poses of the mission are not used.
+    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
+    return scenario.model_copy(update={"imu": imu, "pipeline": pipeline})
+
+
+def mission(name: str, model: str, seed: int, duration_s: float) -> tuple[FloatArray, FloatArray]:
+    """Simulate and calibrate; return errors and sigmas: rotation (3) in deg, position (3) in mm, latency in ms."""
+    scenario = scenario_with_imu(name, model, seed)
+    options = SimulationOptions(
+        duration_s=duration_s, protocol=SuperframeMasterConfig(kind="superframe"), seed=seed
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        run = simulate(scenario, options, folder=Path(folder))
+        path = run.master_logs[0].recording()
+        if path is None or run.imu is None:
+            raise SystemExit("the mission has no recording")
+        started_s = time.process_time()
+        found = calibrate_recorded_imu(load_recording(path), read_imu_samples(path))
+        cpu_s = time.process_time() - started_s
+    truth = run.imu.truth
+    gyro_matrix = np.asarray(np.linalg.inv(truth.gyro_matrix), np.float64)
+    calibration = found.calibration
+    rotation, _ = in_main_axes(truth.mounting.R_robot_imu, gyro_matrix, calibration.setup.main_axis)
+    estimate = rotation_from_quaternion(np.array(found.parameters.orientation_xyzw))
+    error = np.concatenate(
+        [
+            np.degrees(log_so3(estimate @ rotation.T)),
+            1e3 * (np.array(found.parameters.position_m) - truth.mounting.position_m),
+            [found.parameters.latency_ns / 1e6 - 1e3 * truth.latency_s],
+        ]
+    )
+    covariance = np.array(found.covariance.matrix)[:7, :7]
+    order = [3, 4, 5, 0, 1, 2, 6]
+    scale = np.array([180 / np.pi] * 3 + [1e3] * 4)
+    sigmas = scale * np.sqrt(np.diag(covariance))[order]
+    z = np.abs(error / sigmas)
+    print(
+        f"{seed:4d} rotation {np.linalg.norm(error[:3]):.3f} deg ({z[:3].max():.1f})  "
+        f"position {np.abs(error[3:5]).max():.1f}, {abs(error[5]):.1f} mm ({z[3:6].max():.1f})  "
+        f"latency {error[6]:+.2f} ms ({z[6]:.1f})  Birge {calibration.birge_ratio:.2f}, "
+        f"log Bayes factor {calibration.log_bayes_factor:+.0f}, failed {found.failed_checks()}, {cpu_s:.1f} s",
+        flush=True,
+    )
+    return error, sigmas
+
+
+def main() -> None:
+    """Run all missions, then print the summary."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("model", choices=["industrial", "consumer"])
+    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--duration", type=float, default=300.0)
+    parser.add_argument("--scenario", default="dynamic")
+    arguments = parser.parse_args()
+    configure_logging("critical")
+    found = [
+        mission(arguments.scenario, arguments.model, seed, arguments.duration)
+        for seed in range(arguments.first, arguments.first + arguments.seeds)
+    ]
+    errors, sigmas = np.array([each[0] for each in found]), np.array([each[1] for each in found])
+    z = errors / sigmas
+    for name, sizes, within in (
+        ("rotation", np.linalg.norm(errors[:, :3], axis=1), z[:, :3]),
+        ("horizontal", np.abs(errors[:, 3:5]).max(axis=1), z[:, 3:5]),
+        ("vertical", np.abs(errors[:, 5]), z[:, 5:6]),
+        ("latency", np.abs(errors[:, 6]), z[:, 6:]),
+    ):
+        print(
+            f"{name:>10}: rms {np.sqrt(np.mean(sizes**2)):.3f}, largest {sizes.max():.3f}, "
+            f"within {LIMITS[name]}: {np.mean(sizes <= LIMITS[name]):.0%}, "
+            f"components within 2 sigmas: {np.mean(np.abs(within) < 2):.1%}, mean square {np.mean(within**2):.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -81,7 +81,7 @@ def write_imu_recording(path: Path, drive: UncalibratedDrive) -> None:
     parameters = Parameters(
         stations=tuple(StationParameters(station=number, prism=number) for number in (1, 2, 3)),
         prisms=tuple(
-            PrismPosition(prism=number, position_m=tuple(position))  # type: ignore[arg-type]
+            PrismPosition(prism=number, position_m=tuple(position))
             for number, position in enumerate(layout.tolist(), start=1)
         ),
         imu=imu,

@@ -1,0 +1,218 @@
+"""Accuracy of poses with an IMU, post-processed: three, two and one stations, the gyro alone, outages; CPU time.
+
+    python benchmarks/run.py imu [--model industrial|consumer] [--scenario dynamic] [--seeds 4] [--first 12]
+        [--duration 600] [--outage SECONDS] [--missions FOLDER]
+
+Simulates missions with an IMU whose mounting, latency and gyro matrix are known exactly; the robot is shaken while it drives. Fits
+each recording without the IMU and with it, from the measurements of three, two and one stations, and compares poses 20
+times a second with the truth. Two seconds at either end are left out. Prints rms errors of the robot's origin, of the prisms'
+centroid and of the rotation; mean NEES of the centroid's poses (6 expected) and the share above 22.5 (0.001
+expected); CPU seconds of fit and poses. --outage: all measurements are missing for so long, once a minute; the errors are
+those inside. --missions: keep the missions' recordings in a folder, and use those that it holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from tsgt.config import SuperframeMasterConfig
+from tsgt.errors import GeometryError
+from tsgt.estimation.inertial import inertial_samples
+from tsgt.estimation.observations import build_observations, centroid_m
+from tsgt.geometry import log_so3
+from tsgt.geometry.batch import fit_trajectory
+from tsgt.geometry.inertial import fit_inertial_trajectory
+from tsgt.log import configure_logging
+from tsgt.model import MotionPrior
+from tsgt.recording import load_recording, read_imu_samples
+from tsgt.simulation.options import SimulationOptions
+from tsgt.simulation.runner import simulate
+from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import InertialSamples, InertialTrajectory
+    from tsgt.geometry.trajectory import Observations, Trajectory
+    from tsgt.model import ImuParameters
+
+POSES_HZ = 20.0
+MARGIN_S = 2.0
+OUTAGE_PERIOD_S = 60.0
+NEES_LIMIT = 22.5  # Exceeded by 1 in 1000 of chi-square with 6 degrees of freedom
+VARIANTS = (
+    ("no IMU, 3 stations", 3, None),
+    ("3 stations", 3, "imu"),
+    ("2 stations", 2, "imu"),
+    ("1 station", 1, "imu"),
+    ("gyro alone, 3 stations", 3, "gyro"),
+    ("gyro alone, 2 stations", 2, "gyro"),
+)
+
+
+class Mission(NamedTuple):
+    """What a fit takes, and the truth."""
+
+    observations: Observations
+    samples: InertialSamples
+    imu: ImuParameters
+    centroid_m: FloatArray
+    time_s: FloatArray  # (N,) epochs
+    position_m: FloatArray  # (N, 3) true position of the origin
+    rotation: FloatArray  # (N, 3, 3)
+
+
+def simulated(arguments: argparse.Namespace, seed: int, folder: Path) -> Mission:
+    """Simulate a mission, or read the one that the folder holds."""
+    stem = f"{arguments.scenario}-{arguments.model}-{seed}-{arguments.duration:.0f}"
+    recording, truth = folder / f"{stem}.jsonl", folder / f"{stem}.npz"
+    if not truth.exists():
+        scenario = find_scenario(arguments.scenario)
+        imu = scenario.imu.model_copy(update={"model": arguments.model})
+        # The poses of the mission are not used.
+        pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
+        scenario = scenario.model_copy(update={"imu": imu, "pipeline": pipeline})
+        options = SimulationOptions(
+            duration_s=arguments.duration, protocol=SuperframeMasterConfig(kind="superframe"), seed=seed
+        )
+        with tempfile.TemporaryDirectory() as name:
+            run = simulate(scenario, options, folder=Path(name))
+            path = run.master_logs[0].recording()
+            if path is None or run.imu is None:
+                raise SystemExit("the mission has no recording")
+            recording.write_bytes(path.read_bytes())
+        time_s = np.arange(1.0, arguments.duration - 0.5, 1 / POSES_HZ)
+        matrix = np.linalg.inv(run.imu.truth.gyro_matrix)
+        np.savez(
+            truth, time_s=time_s, poses=run.true_poses(time_s), start_ns=run.start_ns, gyro_matrix=matrix
+        )
+    known = np.load(truth)
+    loaded = load_recording(recording)
+    imu_parameters = loaded.parameters.imu
+    if imu_parameters is None:
+        raise SystemExit(f"{recording} has no IMU")
+    first, second, third = ((a, b, c) for a, b, c in known["gyro_matrix"].tolist())
+    imu_parameters = replace(imu_parameters, gyro_matrix=(first, second, third))
+    origin_ns = int(known["start_ns"])
+    observations, _ = build_observations(loaded.parameters, loaded.measurements, origin_ns=origin_ns)
+    samples = inertial_samples(read_imu_samples(recording), imu_parameters, origin_ns)
+    poses = known["poses"]
+    return Mission(
+        observations,
+        samples,
+        imu_parameters,
+        centroid_m(loaded.parameters),
+        known["time_s"],
+        poses[:, :3, 3],
+        poses[:, :3, :3],
+    )
+
+
+def fitted(mission: Mission, observations: Observations, kind: str | None) -> Trajectory | InertialTrajectory:
+    """Fit a trajectory without the IMU (kind None), with it, or with its gyro alone."""
+    if kind is None:
+        return fit_trajectory(observations).trajectory
+    return fit_inertial_trajectory(
+        observations,
+        mission.samples,
+        mission.imu,
+        reference_m=mission.centroid_m,
+        gyro_only=MotionPrior() if kind == "gyro" else None,
+    ).trajectory
+
+
+def evaluate(mission: Mission, stations: int, kind: str | None, outage_s: float) -> FloatArray:
+    """Squared errors of origin and centroid in m^2, of rotation in rad^2, NEES, each (N,); CPU in s, twice: (6, N)."""
+    observations = mission.observations.select(mission.observations.station < stations)
+    first_s, last_s = observations.time_s[0] + MARGIN_S, observations.time_s[-1] - MARGIN_S
+    rows = (mission.time_s > first_s) & (mission.time_s < last_s)
+    if outage_s:
+        # From the middle of each minute on.
+        observations = observations.select(~_missing(observations.time_s, outage_s))
+        rows &= _missing(mission.time_s, outage_s)
+    started_s = time.process_time()
+    trajectory = fitted(mission, observations, kind)
+    fitted_s = time.process_time()
+    time_s, true_position, true_rotation = (
+        mission.time_s[rows],
+        mission.position_m[rows],
+        mission.rotation[rows],
+    )
+    states, covariance = trajectory.at(time_s, dim=6)
+    ended_s = time.process_time()
+    rotation_error = log_so3(np.swapaxes(true_rotation, 1, 2) @ states.rotation)
+    centroid_error = states.position - true_position - true_rotation @ mission.centroid_m
+    origin_error = states.position - states.rotation @ mission.centroid_m - true_position
+    error = np.concatenate([centroid_error, rotation_error], axis=1)
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    squares = [(each**2).sum(axis=1) for each in (origin_error, centroid_error, rotation_error)]
+    cpu_s = np.ones_like(nees)
+    return np.array([*squares, nees, (fitted_s - started_s) * cpu_s, (ended_s - fitted_s) * cpu_s])
+
+
+def _missing(time_s: FloatArray, outage_s: float) -> NDArray[np.bool_]:
+    phase_s = np.mod(time_s, OUTAGE_PERIOD_S) - 0.5 * OUTAGE_PERIOD_S
+    missing: NDArray[np.bool_] = (phase_s > 0) & (phase_s < outage_s)
+    return missing
+
+
+def row(name: str, found: FloatArray) -> str:
+    """Return one line of the table."""
+    rms = np.sqrt(found[:3].mean(axis=1)) * [1e3, 1e3, 180 / np.pi]
+    p95 = np.sqrt(np.quantile(found[1], 0.95)) * 1e3
+    return (
+        f"{name:<24} {rms[0]:8.2f} {rms[1]:8.2f} {p95:8.2f} {rms[2]:8.3f} {found[3].mean():8.1f} "
+        f"{(found[3] > NEES_LIMIT).mean():8.4f} {found[4].mean():8.2f} {found[5].mean():8.2f}"
+    )
+
+
+def main() -> None:
+    """Print the table of each mission, and that of all."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--model", choices=["industrial", "consumer"], default="industrial")
+    parser.add_argument("--scenario", default="dynamic")
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--first", type=int, default=12)
+    parser.add_argument("--duration", type=float, default=600.0)
+    parser.add_argument("--outage", type=float, default=0.0)
+    parser.add_argument("--missions", type=Path)
+    arguments = parser.parse_args()
+    configure_logging("critical")
+    head = (
+        f"{'':<24} {'origin':>8} {'centroid':>8} {'p95':>8} {'rotation':>8} {'NEES':>8} "
+        f"{'> 22.5':>8} {'fit':>8} {'poses':>8}\n{'':<24} {'mm':>8} {'mm':>8} {'mm':>8} {'deg':>8} {'':>8} "
+        f"{'':>8} {'CPU s':>8} {'CPU s':>8}"
+    )
+    total: dict[str, list[FloatArray]] = {name: [] for name, _, _ in VARIANTS}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = arguments.missions or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        for seed in range(arguments.first, arguments.first + arguments.seeds):
+            mission = simulated(arguments, seed, folder)
+            print(f"seed {seed}\n{head}")
+            for name, stations, kind in VARIANTS:
+                try:
+                    found = evaluate(mission, stations, kind, arguments.outage)
+                except GeometryError as error:
+                    print(f"{name:<24} {error}", flush=True)
+                    continue
+                total[name].append(found)
+                print(row(name, found), flush=True)
+    print(f"all {arguments.seeds} missions, {arguments.scenario}, {arguments.model}\n{head}")
+    for name, each in total.items():
+        if each:
+            print(row(name, np.concatenate(each, axis=1)))
+
+
+if __name__ == "__main__":
+    main()

@@ -43,8 +43,7 @@ CORRELATION_TIMES_S: dict[str, float | None] = {
 }
 FREE_TIME_S = (0.03, 10.0)
 SIGMAS = (1e-3, 1e3)
-SCALES = (0.5, 20.0)
-DEVIATIONS = (0.1, 10.0)
+SCALES = (0.5, 30.0)
 TIME_SCALES = (0.05, 1.0)
 _TIMES = (2, 5)
 
@@ -52,7 +51,7 @@ _TIMES = (2, 5)
 def tuned(observations: Observations, time_s: float | None) -> Hyperparameters:
     """Tune sigmas and noise scale with a given correlation time, or with the best."""
     start = log_parameters(MotionPrior(), np.ones((len(observations.frames), 3)))
-    limits = [SIGMAS] * 6 + [SCALES] + [DEVIATIONS] * (len(start) - 8) + [TIME_SCALES]
+    limits = [SIGMAS] * 6 + [SCALES] * (len(start) - 7) + [TIME_SCALES]
     for row in _TIMES:
         limits[row] = FREE_TIME_S if time_s is None else (time_s, time_s)
         if time_s is not None:

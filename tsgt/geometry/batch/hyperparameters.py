@@ -65,15 +65,13 @@ SEGMENTS = 4  # Evenly spread segments that represent a long recording
 MIN_MEASUREMENTS = 30  # Per segment
 _SIGMA_PARAMETERS = np.array([0, 0, 1, 3, 3, 4])  # By axis; x and y share one, roll and pitch too
 _TIME_PARAMETERS = (2, 5)
-_SCALE_PARAMETER = (
-    6  # Common factor on the noise; followed by each station's and component's deviation from it
-)
-_LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03, 0.7])
+_SCALE_PARAMETERS = slice(6, -1)  # Factors on the noise by station and component
+_LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03])
 _MIN_SIGMA = 3e-3
-_UPPER = np.log([30.0, 30.0, 10.0, 30.0, 30.0, 10.0, 20.0])
+_UPPER = np.log([30.0, 30.0, 10.0, 30.0, 30.0, 10.0])
 # A prior of white acceleration follows every measurement if it may, and then there seems to be no noise. No instrument is
 # better than half its data sheet.
-_DEVIATION_LIMITS = np.log([0.7, 10.0])
+_SCALE_LIMITS = np.log([0.5, 30.0])
 _ADAPTED_ITERATIONS = 2  # The next adaptation need not wait for convergence
 _TIME_SCALE_LIMITS = np.log([0.05, 1.0])
 _MEDIAN_SQUARED_DISTANCE = 2.37  # Of the chi-square distribution with 3 degrees of freedom
@@ -175,13 +173,13 @@ def tune(
     """
     scales = np.ones((len(observations.frames), 3)) * (1.0 if noise_scale is None else noise_scale)
     initial = log_parameters(MotionPrior() if start is None else start, scales)
-    lowest, highest = np.repeat(_DEVIATION_LIMITS[:, None], scales.size, axis=1)
+    lowest, highest = np.repeat(_SCALE_LIMITS[:, None], scales.size, axis=1)
     lower = np.minimum(np.concatenate([_LOWER, lowest, _TIME_SCALE_LIMITS[:1]]), initial)
     upper = np.maximum(np.concatenate([_UPPER, highest, _TIME_SCALE_LIMITS[1:]]), initial)
     if noise_scale is not None:
-        lower[_SCALE_PARAMETER:] = upper[_SCALE_PARAMETER:] = initial[_SCALE_PARAMETER:]
+        lower[len(_LOWER) :] = upper[len(_LOWER) :] = initial[len(_LOWER) :]
     if noise_only:
-        lower[:_SCALE_PARAMETER] = upper[:_SCALE_PARAMETER] = initial[:_SCALE_PARAMETER]
+        lower[: len(_LOWER)] = upper[: len(_LOWER)] = initial[: len(_LOWER)]
     return maximise_evidence(observations, initial, lower, upper, on_progress=on_progress)
 
 
@@ -271,24 +269,22 @@ def _without_blunders(observations: Observations) -> tuple[Observations, States]
 
 
 def log_parameters(prior: MotionPrior, scales: FloatArray) -> FloatArray:
-    """(8 + 3 S,) logarithms of prior and noise scales, (S, 3).
+    """(7 + 3 S,) logarithms of prior and noise scales, (S, 3).
 
-    Acceleration sigmas x and z and correlation time, the same of the rotation, the common factor on the noise, each factor's
-    deviation from it, and a factor on the time sigmas. These allow for errors that measurements share for minutes, which do
-    not scatter: with all of them as white noise, there would seem to be less noise of the instruments. The factor is for
-    the tuning only.
+    Acceleration sigmas x and z and correlation time, the same of the rotation, the factors on the noise, and one on the time
+    sigmas. These allow for errors that measurements share for minutes, which do not scatter: with all of them as white noise,
+    there would seem to be less noise of the instruments. The factor is for the tuning only.
     """
     sigmas = axis_sigmas(prior)
     x, _, z, roll, _, yaw = sigmas
     times_s = prior.acceleration_correlation_time_s, prior.angular_acceleration_correlation_time_s
     motion = np.log([x, z, times_s[0], roll, yaw, times_s[1]])
-    log_scales = np.log(scales).ravel()
-    return np.concatenate([motion, [log_scales.mean()], log_scales - log_scales.mean(), [0.0]])
+    return np.concatenate([motion, np.log(scales).ravel(), [0.0]])
 
 
 def _from_log_parameters(parameters: FloatArray) -> tuple[MotionPrior, FloatArray]:
     values = np.exp(parameters)
-    scales = values[_SCALE_PARAMETER] * values[_SCALE_PARAMETER + 1 : -1].reshape(-1, 3)
+    scales = values[_SCALE_PARAMETERS].reshape(-1, 3)
     return prior_from_axes(list(values[_SIGMA_PARAMETERS]), list(values[list(_TIME_PARAMETERS)])), scales
 
 
@@ -299,13 +295,15 @@ def _with_noise(observations: Observations, parameters: FloatArray) -> Observati
 
 
 def _log_hyperprior(parameters: FloatArray) -> Curved:
-    """Log density of the factors' deviations from the common one."""
-    factors = slice(_SCALE_PARAMETER + 1, -1)
-    gradient, precision = np.zeros_like(parameters), np.zeros_like(parameters)
-    deviations = parameters[factors] / SCALE_SPREAD
-    gradient[factors] = -deviations / SCALE_SPREAD
-    precision[factors] = SCALE_SPREAD**-2.0
-    return Curved(-0.5 * float(deviations @ deviations), gradient, np.diag(precision))
+    """Log density of the factors' deviations from the most probable common one, their mean."""
+    factors = parameters[_SCALE_PARAMETERS]
+    deviations = (factors - factors.mean()) / SCALE_SPREAD
+    gradient, precision = np.zeros_like(parameters), np.zeros((len(parameters), len(parameters)))
+    gradient[_SCALE_PARAMETERS] = -deviations / SCALE_SPREAD
+    precision[_SCALE_PARAMETERS, _SCALE_PARAMETERS] = (
+        np.eye(len(factors)) - 1.0 / len(factors)
+    ) / SCALE_SPREAD**2
+    return Curved(-0.5 * float(deviations @ deviations), gradient, precision)
 
 
 def _evidence(segment: _Segment, parameters: FloatArray) -> Curved:
@@ -329,8 +327,7 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> Curved:
     covariance, cross_covariance = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
     by_scale, gradient[-1] = log_scale_gradient(solution, observations, covariance)
-    gradient[_SCALE_PARAMETER] = by_scale.sum()
-    gradient[_SCALE_PARAMETER + 1 : -1] = by_scale.ravel()
+    gradient[_SCALE_PARAMETERS] = by_scale.ravel()
     moments = expected_moments(solution, covariance, cross_covariance)
     sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
     energies = expected_squared_distances(moments, solution.process.phi, solution.process.information)
@@ -374,8 +371,7 @@ def _average_information(
     mixing = np.zeros((len(process.products) + len(noise.products), len(parameters)))
     count = len(process.products)
     mixing[np.arange(count), [*sigma_parameters, *_TIME_PARAMETERS]] = 1.0
-    mixing[count:-1, _SCALE_PARAMETER] = 1.0
-    mixing[count:, _SCALE_PARAMETER + 1 :] = np.eye(len(mixing) - count)
+    mixing[count:, len(_LOWER) :] = np.eye(len(mixing) - count)
     return AverageInformation.of(solution, (process, noise), mixing)
 
 

@@ -186,6 +186,8 @@ def test_every_number_of_the_page_is_in_the_json(made: Made) -> None:
         assert verdict["text"].replace("`", "") in {text.removeprefix("Do not trust: ") for text in listed}
         assert not verdict["repair"] or verdict["repair"].replace("`", "") in listed
     known = [v for number in numbers_in(printed) for v in (number, 100 * number)]
+    # The table of the set-up is in mm, mrad, ms and ppm.
+    known += [factor * v for v in numbers_in(printed["refinement"]) for factor in (1e3, 1e6)]
     shown = re.findall(r"<(?:td|dd|p)>(.*?)</", page.split("About this recording</h2>")[0], flags=re.DOTALL)
     checked = 0
     for text in map(html.unescape, shown):

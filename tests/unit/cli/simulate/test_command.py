@@ -122,10 +122,13 @@ def test_figures_follow_from_the_files(tsgt: Tsgt, tmp_path: Path) -> None:
         counted = sum(synchronised_s <= arrival_s <= 60 for arrival_s in arrivals_s.values())
         assert station["rate_hz"] == pytest.approx(counted / (60 - synchronised_s), rel=1e-6)
 
-    kinds = {pose["kind"] for pose in of["pose"]}
-    assert kinds == found["live"].keys()
-    for kind in kinds:
-        _check_poses(found["live"][kind], [pose for pose in of["pose"] if pose["kind"] == kind], true)
+    streamed: dict[str, list[dict[str, Any]]] = {}
+    for pose in of["pose"]:
+        delay = f"_{pose['delay_s']:g}s" if "delay_s" in pose else ""
+        streamed.setdefault(pose["kind"] + delay, []).append(pose)
+    assert streamed.keys() == found["live"].keys()
+    for name, poses in streamed.items():
+        _check_poses(found["live"][name], poses, true)
     for estimator, figures in found["estimators"].items():
         output = tmp_path / f"{estimator}.jsonl"
         assert tsgt("process", recording, "--estimator", estimator, "--output", output).code == 0

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.inertial_drive import imu_parameters, inertial_drive
+from harness.inertial_drive import InertialDrive, imu_parameters, inertial_drive
 from harness.records import HEADER, SECOND, START
+from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.inertial import Gravity, Mounting
@@ -44,11 +45,20 @@ class UncalibratedDrive:
 
 
 def uncalibrated_drive(
-    duration_s: float, *, grade: str = "industrial", latency_s: float = 0.0043, seed: int = 0
+    duration_s: float,
+    *,
+    grade: str = "industrial",
+    latency_s: float = 0.0043,
+    seed: int = 0,
+    flat: bool = False,
 ) -> UncalibratedDrive:
-    """Drive through the scenario ``dynamic``, shaken, with an IMU that has errors of scale and misalignment."""
+    """Drive through the scenario ``dynamic``, shaken, with an IMU that has errors of scale and misalignment.
+
+    ``flat``: without slopes, bumps and shaking.
+    """
     imu = imu_parameters(grade)
-    drive = inertial_drive(duration_s, seed=seed).shaken(imu, seed=seed)
+    drive = inertial_drive(duration_s, seed=seed)
+    drive = on_flat_ground(drive) if flat else drive.shaken(imu, seed=seed)
     rng = np.random.default_rng([seed, 4])
     gyro, accelerometer = (np.eye(3) + rng.normal(0.0, MATRIX_SIGMAS[grade], (3, 3)) for _ in range(2))
     exact = drive.samples(imu, seed=seed)
@@ -71,6 +81,13 @@ def uncalibrated_drive(
     )
     observations = replace(drive.measure(seed=seed), layout=drive.layout - centroid)
     return UncalibratedDrive(observations, samples, imu, truth, centroid)
+
+
+def on_flat_ground(drive: InertialDrive) -> InertialDrive:
+    """Return a drive that only yaws, at one height."""
+    yaw = np.unwrap(drive.rotation.as_euler("ZYX")[:, :1], axis=0)
+    position = drive.position * [1.0, 1.0, 0.0] + [0.0, 0.0, -1.0]
+    return replace(drive, position=position, rotation=Rotation.from_euler("Z", yaw))
 
 
 def write_imu_recording(path: Path, drive: UncalibratedDrive) -> None:

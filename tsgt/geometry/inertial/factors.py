@@ -145,9 +145,7 @@ def assemble_inertial(
     """
     count = len(knots)
     linearised = linearise(observations, _as_states(knots, kinematics, gravity, factors), knot_index)
-    whitened = _by_inertial_states(
-        linearised.whitened(observations), gyro_only=not factors.with_accelerometer
-    )
+    whitened = by_inertial_states(linearised.whitened(observations), gyro_only=not factors.with_accelerometer)
     squared_distances = dot(whitened[:, :, 15], whitened[:, :, 15])
     weights, loss = robust_loss(squared_distances, active=active, rejectable=rejectable)
     diagonal = np.zeros((count, INERTIAL_STATE_DIM, INERTIAL_STATE_DIM))
@@ -322,8 +320,10 @@ def _as_states(
     )
 
 
-def _by_inertial_states(rows: FloatArray, *, gyro_only: bool) -> FloatArray:
+def by_inertial_states(rows: FloatArray, *, gyro_only: bool) -> FloatArray:
     """Rows of measurements by the 18 components of a state without IMU, (M, 3, 19), as rows by those with, (M, 3, 16).
+
+    The last column of both is the residual.
 
     The acceleration acts over the time from the knot to the measurement, at most 10 ms, over which neither the bias of the
     accelerometer nor the rotation changes it by what could be measured.

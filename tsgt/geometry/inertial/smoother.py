@@ -16,6 +16,7 @@ from tsgt.errors import GeometryError
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading, states_on_tracks
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory
+from tsgt.geometry.inertial.sensitivity import residual_variances, setup_displacement
 from tsgt.geometry.inertial.solver import InertialSetup, inertial_knot_times, solve_inertial
 from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting, concatenate_inertial_states
 from tsgt.geometry.trajectory import nearest_knots
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.inertial.solver import InertialSolution
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import Observations
+    from tsgt.geometry.trajectory import Observations, SetupJacobian
     from tsgt.model import ImuNoise, ImuParameters, MotionPrior
 
 SEGMENT_S = 240.0  # Over which the gyro turns by a few degrees more than it says
@@ -51,6 +52,9 @@ class InertialFit:
     residuals_m: FloatArray
     squared_distances: FloatArray
     weights: FloatArray
+    residual_variances_m2: (
+        FloatArray  # (M, 3) expected squares of the residuals; NaN where they carry no information
+    )
     tilt_sigma_rad: float  # One sigma of the tilt of gravity after the fit, the larger of both
 
 
@@ -83,6 +87,7 @@ def fit_inertial_trajectory(
     *,
     reference_m: FloatArray,
     gyro_only: MotionPrior | None = None,
+    setup_jacobian: SetupJacobian | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> InertialFit:
     """Fit a trajectory to measurements of any number of prisms and to the samples of an IMU.
@@ -95,6 +100,7 @@ def fit_inertial_trajectory(
         missing.
     reference_m : Origin of that layout, (3,) in the robot frame: the point whose poses the trajectory gives.
     gyro_only : Do not use the specific forces but this prior of the motion.
+    setup_jacobian : Sensitivity to the set-up's errors, for the part of the covariance that all states share.
     on_progress : Called with the completed share of the work, 0 to 1.
     """
     report_progress = on_progress or (lambda _: None)
@@ -112,11 +118,14 @@ def fit_inertial_trajectory(
     ends = [0, *np.searchsorted(time_s, edges_s[1:-1]).tolist(), len(time_s)]
     knot_index = nearest_knots(time_s, mounted.time_s)
 
-    def solve(start_s: float, end_s: float, near: InertialStates) -> tuple[InertialSolution, int]:
+    def solve(
+        start_s: float, end_s: float, near: InertialStates
+    ) -> tuple[InertialSolution, Observations, int]:
         solved = slice(*np.searchsorted(time_s, (start_s, np.nextafter(end_s, np.inf))))
         rows = slice(*np.searchsorted(knot_index, (solved.start, solved.stop)))
         some = mounted.select(rows)
-        return solve_inertial(some, setup, extended(near, time_s[solved], some, setup), gravity), solved.start
+        guess = extended(near, time_s[solved], some, setup)
+        return solve_inertial(some, setup, guess, gravity), some, solved.start
 
     first = int(np.clip(np.searchsorted(edges_s, near.time_s[0], side="right") - 1, 0, count - 1))
     while (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
@@ -129,8 +138,9 @@ def fit_inertial_trajectory(
         report_progress(len(parts) / count)
         if parts:
             near = parts[number - 1 if number > first else number + 1].knots
-        solution, offset = solve(edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near)
-        parts[number] = _Part.of(solution, slice(ends[number] - offset, ends[number + 1] - offset))
+        solution, some, offset = solve(edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near)
+        kept = slice(ends[number] - offset, ends[number + 1] - offset)
+        parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian, gyro_only is not None)
     report_progress(1.0)
     ordered = [parts[number] for number in range(count)]
     middle = ordered[count // 2]
@@ -142,6 +152,9 @@ def fit_inertial_trajectory(
         np.concatenate([part.covariance for part in ordered]),
         np.concatenate([part.cross_covariance for part in ordered])[: len(time_s) - 1],
         gyro_only,
+        None
+        if setup_jacobian is None
+        else np.concatenate([part.displacement for part in ordered if part.displacement is not None]),
     )
     return InertialFit(
         trajectory,
@@ -149,6 +162,7 @@ def fit_inertial_trajectory(
         np.concatenate([part.residuals_m for part in ordered]),
         np.concatenate([part.squared_distances for part in ordered]),
         np.concatenate([part.weights for part in ordered]),
+        np.concatenate([part.residual_variances_m2 for part in ordered]),
         max(part.tilt_sigma_rad for part in ordered),
     )
 
@@ -163,14 +177,29 @@ class _Part:
     residuals_m: FloatArray
     squared_distances: FloatArray
     weights: FloatArray
+    residual_variances_m2: FloatArray
+    displacement: FloatArray | None
     tilt: FloatArray
     tilt_sigma_rad: float
 
     @classmethod
-    def of(cls, solution: InertialSolution, kept: slice) -> _Part:
+    def of(
+        cls,
+        solution: InertialSolution,
+        observations: Observations,
+        kept: slice,
+        mounting: Mounting,
+        setup_jacobian: SetupJacobian | None,
+        gyro_only: bool,
+    ) -> _Part:
         """Return the knots ``kept`` and their measurements."""
         covariance, cross_covariance = solution.factor.marginals()
         rows = slice(*np.searchsorted(solution.knot_index, (kept.start, kept.stop)))
+        displacement = None
+        if setup_jacobian is not None:
+            displacement = setup_displacement(
+                solution, observations, mounting, setup_jacobian, gyro_only=gyro_only
+            )[kept]
         return cls(
             solution.knots.select(kept),
             covariance[kept],
@@ -178,6 +207,8 @@ class _Part:
             solution.linearised.residuals_m[rows],
             solution.squared_distances[rows],
             solution.weights[rows],
+            residual_variances(solution, observations, covariance, gyro_only=gyro_only)[rows],
+            displacement,
             solution.gravity.tilt,
             float(np.sqrt(np.diag(solution.factor.shared_covariance).max())),
         )

@@ -28,8 +28,6 @@ def setup_displacement(
     observations: Observations,
     mounting: Mounting,
     setup_jacobian: SetupJacobian,
-    *,
-    gyro_only: bool,
 ) -> FloatArray:
     """(K, 15, r) displacement of the states by the set-up's errors, in the columns of a factor of their covariance.
 
@@ -39,7 +37,7 @@ def setup_displacement(
     # Prisms are uncertain along the axes of the robot.
     of_robot = replace(linearised, rotation=linearised.rotation @ mounting.rotation.T)
     by_setup = setup_jacobian(observations, of_robot)
-    jacobian = _jacobian(solution, gyro_only=gyro_only)
+    jacobian = _jacobian(solution)
     information = np.linalg.inv(linearised.covariance(observations)) * solution.weights[:, None, None]
     mixed = np.zeros((len(solution.knots), INERTIAL_STATE_DIM, by_setup.shape[2]))
     np.add.at(mixed, solution.knot_index, np.swapaxes(jacobian, 1, 2) @ (information @ by_setup))
@@ -51,7 +49,7 @@ def setup_displacement(
 
 
 def residual_variances(
-    solution: InertialSolution, observations: Observations, covariance: FloatArray, *, gyro_only: bool
+    solution: InertialSolution, observations: Observations, covariance: FloatArray
 ) -> FloatArray:
     """(M, 3) expected squares of the residuals; NaN where they carry no information.
 
@@ -59,14 +57,16 @@ def residual_variances(
     Q_vv = Q_ll - A Q_xx A^T (Baarda 1968, A testing procedure for use in geodetic networks).
     """
     noise = np.diagonal(solution.linearised.covariance(observations), axis1=1, axis2=2)
-    jacobian = _jacobian(solution, gyro_only=gyro_only)
+    jacobian = _jacobian(solution)
     own = np.einsum("mij,mjk,mik->mi", jacobian, covariance[solution.knot_index], jacobian, optimize=True)
     expected = noise - solution.weights[:, None] * own
     return np.where(expected > MIN_VARIANCE_SHARE * noise, expected, np.nan)
 
 
-def _jacobian(solution: InertialSolution, *, gyro_only: bool) -> FloatArray:
+def _jacobian(solution: InertialSolution) -> FloatArray:
     """(M, 3, 15) of the residuals by the states."""
     linearised = solution.linearised
     rows = np.concatenate([linearised.jacobian, linearised.residuals_m[:, :, None]], axis=2)
-    return by_inertial_states(rows, gyro_only=gyro_only)[:, :, :INERTIAL_STATE_DIM]
+    return by_inertial_states(rows, gyro_only=not solution.factors.with_accelerometer)[
+        :, :, :INERTIAL_STATE_DIM
+    ]

@@ -140,7 +140,7 @@ def fit_inertial_trajectory(
             near = parts[number - 1 if number > first else number + 1].knots
         solution, some, offset = solve(edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near)
         kept = slice(ends[number] - offset, ends[number + 1] - offset)
-        parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian, gyro_only is not None)
+        parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian)
     report_progress(1.0)
     ordered = [parts[number] for number in range(count)]
     middle = ordered[count // 2]
@@ -190,16 +190,13 @@ class _Part:
         kept: slice,
         mounting: Mounting,
         setup_jacobian: SetupJacobian | None,
-        gyro_only: bool,
     ) -> _Part:
         """Return the knots ``kept`` and their measurements."""
         covariance, cross_covariance = solution.factor.marginals()
         rows = slice(*np.searchsorted(solution.knot_index, (kept.start, kept.stop)))
         displacement = None
         if setup_jacobian is not None:
-            displacement = setup_displacement(
-                solution, observations, mounting, setup_jacobian, gyro_only=gyro_only
-            )[kept]
+            displacement = setup_displacement(solution, observations, mounting, setup_jacobian)[kept]
         return cls(
             solution.knots.select(kept),
             covariance[kept],
@@ -207,7 +204,7 @@ class _Part:
             solution.linearised.residuals_m[rows],
             solution.squared_distances[rows],
             solution.weights[rows],
-            residual_variances(solution, observations, covariance, gyro_only=gyro_only)[rows],
+            residual_variances(solution, observations, covariance)[rows],
             displacement,
             solution.gravity.tilt,
             float(np.sqrt(np.diag(solution.factor.shared_covariance).max())),

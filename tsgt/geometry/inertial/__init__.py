@@ -5,6 +5,7 @@ docs/explanation/imu.md derives the equations.
 """
 
 from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
+from tsgt.geometry.inertial.fixed_lag import InertialFixedLagSmoother, WindowTrajectory
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
@@ -40,6 +41,7 @@ __all__ = [
     "InertialAnchor",
     "InertialFactors",
     "InertialFit",
+    "InertialFixedLagSmoother",
     "InertialSamples",
     "InertialSetup",
     "InertialSolution",
@@ -47,6 +49,7 @@ __all__ = [
     "InertialTrajectory",
     "Mounting",
     "Preintegrated",
+    "WindowTrajectory",
     "anchor_at_end",
     "concatenate_inertial_states",
     "concatenate_samples",

@@ -28,9 +28,9 @@ class BorderedCholesky:
     shared_covariance: FloatArray  # (S, S) inverse of ``C - X^T A^-1 X``: covariance of the shared unknowns
 
     def solve(self, right: FloatArray, shared_right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Solve for the states, (K, B), and for the shared unknowns, (S,)."""
+        """Solve for the states, (K, B), and for the shared unknowns, (S,); or for N right-hand sides, along a last axis."""
         alone = self.states.solve(right)
-        shared = self.shared_covariance @ (shared_right - np.einsum("kbs,kb->s", self.border, alone))
+        shared = self.shared_covariance @ (shared_right - np.tensordot(self.border, alone, ((0, 1), (0, 1))))
         return alone - self.solved_border @ shared, shared
 
     def marginals(self) -> tuple[FloatArray, FloatArray]:
@@ -40,6 +40,12 @@ class BorderedCholesky:
         diagonal += spread @ np.swapaxes(self.solved_border, 1, 2)
         off_diagonal += spread[:-1] @ np.swapaxes(self.solved_border[1:], 1, 2)
         return diagonal, off_diagonal
+
+    def last_covariance(self) -> FloatArray:
+        """(B + S, B + S) covariance of the last state and the shared unknowns."""
+        covariance = np.linalg.inv(self.last_information())
+        symmetric: FloatArray = 0.5 * (covariance + covariance.T)
+        return symmetric
 
     def last_information(self) -> FloatArray:
         """(B + S, B + S) information on the last state and the shared unknowns, all other states eliminated."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.geometry.inertial.preintegration import Preintegrated, preintegrate
+from tsgt.geometry.inertial.preintegration import Preintegrated, concatenate_preintegrated, preintegrate
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, Gravity, InertialStates
 from tsgt.geometry.rigid import (
     IDENTITY,
@@ -70,8 +70,23 @@ class InertialFactors:
         gyro_only: MotionPrior | None = None,
     ) -> InertialFactors:
         """Preintegrate between the states' times, about their biases; ``gyro_only``: prior of the motion in place of forces."""
-        bias = np.zeros(3) if gyro_only else states.bias_or_acceleration[:-1]
-        found = preintegrate(samples, states.time_s[:-1], states.time_s[1:], states.gyro_bias[:-1], bias)
+        return cls.between(
+            samples, states.select(slice(None, -1)), states.time_s[1:], noise, gyro_only=gyro_only
+        )
+
+    @classmethod
+    def between(
+        cls,
+        samples: ContiguousSamples,
+        earlier: InertialStates,
+        end_s: FloatArray,
+        noise: ImuNoise,
+        *,
+        gyro_only: MotionPrior | None = None,
+    ) -> InertialFactors:
+        """Preintegrate from N states to N later times."""
+        bias = np.zeros(3) if gyro_only else earlier.bias_or_acceleration
+        found = preintegrate(samples, earlier.time_s, end_s, earlier.gyro_bias, bias)
         walks = np.array([noise.gyro_bias_walk, noise.accelerometer_bias_walk])
         walk_information = 1.0 / (walks**2 * found.duration_s[:, None])
         if gyro_only is None:
@@ -90,13 +105,28 @@ class InertialFactors:
             ),
         )
 
-    def select(self, rows: slice) -> InertialFactors:
+    def select(self, rows: slice | NDArray[np.intp]) -> InertialFactors:
         """Return the factors of some steps."""
         return InertialFactors(
             self.preintegrated.select(rows),
             self.whitening[rows],
             self.walk_information[rows],
             None if self.motion is None else (self.motion[0][rows], self.motion[1][rows]),
+        )
+
+    def joined(self, others: InertialFactors) -> InertialFactors:
+        """Return these factors, then the others."""
+        motion = None
+        if self.motion is not None and others.motion is not None:
+            motion = (
+                np.concatenate([self.motion[0], others.motion[0]]),
+                np.concatenate([self.motion[1], others.motion[1]]),
+            )
+        return InertialFactors(
+            concatenate_preintegrated([self.preintegrated, others.preintegrated]),
+            np.concatenate([self.whitening, others.whitening]),
+            np.concatenate([self.walk_information, others.walk_information]),
+            motion,
         )
 
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 MAX_KNOT_SPACING_S = 0.5
 """Knots without measurements are inserted into longer gaps: within one step the biases are constant."""
 
-_MAX_BIAS_ROTATION_RAD = 2e-3
+MAX_BIAS_ROTATION_RAD = 2e-3
 """Rotation by a change of the gyro's bias over a step beyond which it is integrated again. To first order the correction
 is wrong by half its square.
 """
@@ -195,7 +195,7 @@ class _Search:
             gain = -float(np.vdot(step, system.gradient) + np.vdot(tilt, system.corner_gradient))
             if gain < PREDICTED_GAIN_TOLERANCE:
                 knots, gravity = knots.retract(step), replace(gravity, tilt=gravity.tilt + tilt)
-                system = _apply_linear_step(system, self.knot_index, step, gain)
+                system = apply_linear_step(system, self.knot_index, step, gain)
                 break
             fraction = 1.0
             while fraction > MIN_STEP_FRACTION:
@@ -239,7 +239,7 @@ class _Search:
             return factors
         found = factors.preintegrated
         moved = knots.gyro_bias[:-1] - found.gyro_bias
-        if not (np.sqrt(dot(moved, moved)) * found.duration_s > _MAX_BIAS_ROTATION_RAD).any():
+        if not (np.sqrt(dot(moved, moved)) * found.duration_s > MAX_BIAS_ROTATION_RAD).any():
             return factors
         return InertialFactors.of(self.setup.samples, knots, self.setup.noise, gyro_only=self.setup.gyro_only)
 
@@ -248,7 +248,7 @@ def _factorise(system: InertialEquations) -> BorderedCholesky:
     return factorise_bordered(system.diagonal, system.off_diagonal, system.border, system.corner)
 
 
-def _apply_linear_step(
+def apply_linear_step(
     system: InertialEquations, knot_index: NDArray[np.intp], step: FloatArray, gain: float
 ) -> InertialEquations:
     """Apply a small step to residuals, weights and cost; Jacobians stay those before the step."""
@@ -257,7 +257,12 @@ def _apply_linear_step(
         system.whitened[:, :, size] + (system.whitened[:, :, :size] @ step[knot_index][:, :, None])[:, :, 0]
     )
     squared_distances = dot(residuals, residuals)
+    # As in factors.assemble_inertial: of the motion from the knot to the measurement, a step changes next to nothing.
+    moved = step[knot_index][:, :9, None]
+    linearised = system.linearised
+    residuals_m = linearised.residuals_m + (linearised.jacobian[:, :, :9] @ moved)[:, :, 0]
     return system._replace(
+        linearised=replace(linearised, residuals_m=residuals_m),
         squared_distances=squared_distances,
         weights=(system.weights > 0) / np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0),
         cost=system.cost - gain,

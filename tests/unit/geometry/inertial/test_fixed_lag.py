@@ -1,0 +1,249 @@
+"""Fixed-lag smoother with an IMU: against the batch solution, against integration by scipy, from nothing, out of order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.inertial_drive import DEG, imu_parameters, inertial_drive
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from tsgt.geometry import log_so3
+from tsgt.geometry.inertial import InertialFixedLagSmoother, fit_inertial_trajectory
+from tsgt.model import MotionPrior
+
+if TYPE_CHECKING:
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import InertialSamples
+    from tsgt.geometry.trajectory import Observations
+
+IMU = imu_parameters()
+DRIVE = inertial_drive(11.0, seed=12)
+SAMPLES = DRIVE.samples(IMU)
+CENTROID = DRIVE.layout.mean(axis=0)
+LAG_S = 3.0
+DELAY_S = 0.35  # Of measurements
+UNTIL_S = 7.0
+
+
+def measurements(stations: int = 3) -> Observations:
+    """Return measurements with the layout from the centroid."""
+    observations = DRIVE.measure(stations=stations)
+    return replace(observations, layout=observations.layout - CENTROID)
+
+
+class Live:
+    """A smoother that is given measurements and lines of samples as they arrive."""
+
+    def __init__(self, *, gyro_only: bool = False) -> None:
+        self.window = InertialFixedLagSmoother(IMU, MotionPrior(), reference_m=CENTROID, gyro_only=gyro_only)
+        self._sampled = 0
+
+    def sample_until(self, time_s: float, samples: InertialSamples = SAMPLES) -> None:
+        """Add the samples up to a time."""
+        stop = int(np.searchsorted(samples.end_s, time_s, side="right"))
+        self.window.add_samples(samples.select(slice(self._sampled, stop)))
+        self._sampled = stop
+
+    def measure(self, observations: Observations) -> None:
+        """Add measurements one by one, each with the samples up to its arrival."""
+        for row in range(len(observations)):
+            now_s = float(observations.time_s[row]) + DELAY_S
+            self.sample_until(now_s)
+            self.window.update(observations.select(slice(row, row + 1)))
+            self.window.marginalise_before(now_s - LAG_S)
+
+
+@cache
+def tracked(stations: int = 3) -> Live:
+    """Seven seconds, live. Not to be changed."""
+    live = Live()
+    observations = measurements(stations)
+    live.measure(observations.select(observations.time_s < UNTIL_S))
+    return live
+
+
+def difference(found: FloatArray, expected: FloatArray) -> FloatArray:
+    """Rotation vectors from one to the other, (N, 3)."""
+    return log_so3(np.swapaxes(expected, 1, 2) @ found)
+
+
+def test_newest_pose_agrees_with_batch() -> None:
+    """Marginalisation keeps the information: pose and covariance at the end are those of all measurements."""
+    observations = measurements()
+    observations = observations.select(observations.time_s < UNTIL_S)
+    fit = fit_inertial_trajectory(observations, SAMPLES, IMU, reference_m=CENTROID)
+    at_s = observations.time_s[-1:]
+    (found, covariance), (expected, expected_covariance) = (
+        tracked().window.trajectory().at(at_s),
+        fit.trajectory.at(at_s),
+    )
+    sigmas = np.sqrt(np.diag(expected_covariance[0]))
+    error = np.concatenate(
+        [found.position - expected.position, difference(found.rotation, expected.rotation)], 1
+    )
+    assert np.abs(error / sigmas).max() < 0.05
+    np.testing.assert_allclose(
+        covariance[0] / np.outer(sigmas, sigmas), expected_covariance[0] / np.outer(sigmas, sigmas), atol=0.05
+    )
+
+
+def test_prediction_equals_integration() -> None:
+    """Strapdown from the newest knot equals scipy's integration of the samples, and the velocity is that of the motion."""
+    window = tracked().window
+    knots, gravity = window.trajectory().inside.knots, window.trajectory().inside.gravity
+    start_s = float(knots.time_s[-1])
+    end_s = start_s + 0.345
+    first = int(np.searchsorted(SAMPLES.end_s, start_s, side="right"))
+    rates = SAMPLES.angular_rate_radps - knots.gyro_bias[-1]
+    forces = SAMPLES.specific_force_mps2 - knots.bias_or_acceleration[-1]
+    fall = gravity.vector()
+    state = np.concatenate(
+        [Rotation.from_matrix(knots.rotation[-1]).as_quat(), knots.position[-1], knots.velocity[-1]]
+    )
+    time_s = start_s
+    for row in range(first, int(np.searchsorted(SAMPLES.end_s, end_s)) + 1):
+
+        def derivative(_: float, y: FloatArray, row: int = row) -> FloatArray:
+            rotation = Rotation.from_quat(y[:4])
+            half = 0.5 * np.append(rates[row], 0.0)
+            x, y_, z, w = y[:4]
+            turn = np.array(
+                [[w, -z, y_, x], [z, w, -x, y_], [-y_, x, w, z], [-x, -y_, -z, w]], dtype=np.float64
+            )
+            return np.concatenate([turn @ half, y[7:10], rotation.apply(forces[row]) + fall])
+
+        until_s = min(float(SAMPLES.end_s[row]), end_s)
+        state = solve_ivp(derivative, (time_s, until_s), state, rtol=1e-10, atol=1e-12).y[:, -1]
+        time_s = until_s
+    mounting = window.trajectory().inside.mounting
+    rotation = Rotation.from_quat(state[:4]).as_matrix()
+    found, _ = window.predict(end_s)
+    np.testing.assert_allclose(
+        found.position[0], state[4:7] + rotation @ mounting.in_imu(np.zeros(3)), atol=1e-6
+    )
+    np.testing.assert_allclose(found.rotation[0], rotation @ mounting.rotation.T, atol=1e-6)
+    step_s = 0.02
+    before, after = window.predict(end_s - step_s)[0], window.predict(end_s)[0]
+    moved = (after.position - before.position) / step_s
+    np.testing.assert_allclose(0.5 * (before.velocity + after.velocity), moved, atol=0.01)
+
+
+def test_predicted_covariance_equals_that_of_a_knot() -> None:
+    """A knot at the time of the prediction, which nothing measures, has the same covariance."""
+    window = tracked().window
+    trajectory = window.trajectory().inside
+    newest_s = float(trajectory.knots.time_s[-1])
+    at_s = newest_s + 0.3
+    _, covariance = window.predict(at_s)
+    observations = measurements()
+    observations = observations.select(observations.time_s < UNTIL_S)
+    far = observations.select(slice(-1, None))
+    # A measurement without weight.
+    far = replace(far, time_s=np.array([at_s]), sigmas_m=1e6 * far.sigmas_m)
+    live = Live()
+    live.measure(observations)
+    live.window.update(far)
+    _, expected = live.window.trajectory().at(np.array([at_s]))
+    scale = np.sqrt(np.diag(expected[0]))
+    ratio = covariance[0] / window._prediction_scale() / np.outer(scale, scale)
+    np.testing.assert_allclose(ratio, expected[0] / np.outer(scale, scale), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("stations", "limit_mm", "limit_deg"), [(3, 5.0, 0.15), (2, 6.0, 0.15), (1, 25.0, 2.0)]
+)
+def test_start_from_nothing(stations: int, limit_mm: float, limit_deg: float) -> None:
+    """The heading is found without any pose, with one station as soon as the robot moves."""
+    window = tracked(stations).window
+    assert window.converged
+    time_s = np.arange(5.0, 6.8, 0.1)
+    states, covariance = window.trajectory().at(time_s)
+    position, rotation = DRIVE.pose_at(time_s)
+    error_m = states.position - position - rotation @ CENTROID
+    error_rad = difference(states.rotation, rotation)
+    assert np.linalg.norm(error_m, axis=1).max() < limit_mm / 1e3
+    assert np.linalg.norm(error_rad, axis=1).max() < limit_deg * DEG
+    errors = np.concatenate([error_m, error_rad], axis=1)
+    assert np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariance), errors).mean() < 15
+
+
+def test_late_samples_and_measurements_count() -> None:
+    """Within the lag the order of arrival does not matter."""
+    observations = measurements()
+    observations = observations.select(observations.time_s < UNTIL_S)
+    late = Live()
+    late.measure(observations.select(slice(None, -8)))
+    late.measure(observations.select(slice(-7, None)))
+    samples = SAMPLES.select(slice(len(SAMPLES)))
+    stop = int(np.searchsorted(samples.end_s, UNTIL_S + DELAY_S))
+    # Ten samples before the newest knots come after all others.
+    gone = slice(stop - 150, stop - 140)
+    order = Live()
+    order.measure(observations.select(slice(None, -8)))
+    order.window.add_samples(samples.select(slice(order._sampled, gone.start)))
+    order.window.add_samples(samples.select(slice(gone.stop, stop)))
+    order._sampled = stop
+    order.measure(observations.select(slice(-8, -1)))
+    order.window.add_samples(samples.select(gone))
+    order.measure(observations.select(slice(-1, None)))
+    late.window.update(observations.select(slice(-8, -7)))
+    in_order = tracked().window
+    at_s = observations.time_s[-1:] - 0.05
+    expected, covariance = in_order.trajectory().at(at_s)
+    sigmas = np.sqrt(np.diag(covariance[0]))
+    for live in (late, order):
+        found, _ = live.window.trajectory().at(at_s)
+        error = np.concatenate(
+            [found.position - expected.position, difference(found.rotation, expected.rotation)], axis=1
+        )
+        assert np.abs(error / sigmas).max() < 0.1
+
+
+def test_outage_is_bridged_and_tracked_on() -> None:
+    """Two seconds without measurements: predictions by the IMU alone, and no new search after."""
+    observations = measurements()
+    live = Live()
+    live.measure(observations.select(observations.time_s < 5.0))
+    live.sample_until(7.0)
+    live.window.marginalise_before(7.0 - LAG_S)
+    state, covariance = live.window.predict(7.0)
+    position, rotation = DRIVE.pose_at(np.array([7.0]))
+    error_m = state.position - position - rotation @ CENTROID
+    assert np.linalg.norm(error_m) < 0.06
+    assert np.linalg.norm(error_m) < 3 * np.sqrt(np.trace(covariance[0, :3, :3]))
+    live.measure(observations.select((observations.time_s > 7.0) & (observations.time_s < 8.0)))
+    assert live.window.reliable_from_s < 2.0
+    assert np.diff(live.window.trajectory().inside.knots.time_s).max() < 0.51
+
+
+def test_window_does_not_grow() -> None:
+    """Numbers of measurements, knots and samples are bounded."""
+    window = tracked().window
+    assert window.observations is not None
+    assert len(window.observations) == len(window.residuals_m) < 1.5 * LAG_S * 7.5
+    assert window._samples is not None
+    assert len(window._samples) < 1.5 * LAG_S * 200
+    assert window.horizon_s <= UNTIL_S + DELAY_S - LAG_S
+
+
+def test_gyro_alone() -> None:
+    """Without the accelerometer three stations still give poses; predictions rest on the motion prior."""
+    observations = measurements()
+    live = Live(gyro_only=True)
+    live.measure(observations.select(observations.time_s < 5.0))
+    time_s = np.arange(2.5, 4.5, 0.1)
+    states, _ = live.window.trajectory().at(time_s)
+    position, rotation = DRIVE.pose_at(time_s)
+    assert np.linalg.norm(states.position - position - rotation @ CENTROID, axis=1).max() < 0.008
+    assert np.linalg.norm(difference(states.rotation, rotation), axis=1).max() < 0.2 * DEG
+    now_s = observations.time_s[observations.time_s < 5.0][-1] + DELAY_S
+    state, covariance = live.window.predict(now_s)
+    position, rotation = DRIVE.pose_at(np.array([now_s]))
+    error_m = np.linalg.norm(state.position - position - rotation @ CENTROID)
+    assert error_m < 3 * np.sqrt(np.trace(covariance[0, :3, :3]))
+    assert np.linalg.norm(difference(state.rotation, rotation)) < 0.3 * DEG

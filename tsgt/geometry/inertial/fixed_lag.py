@@ -1,0 +1,537 @@
+"""Fixed-lag smoother with an IMU: the trajectory online, in a window of knots that moves with time. Sans-I/O.
+
+As without an IMU: knots older than a few seconds are marginalised into an anchor prior, here on the oldest knot and the tilt of
+gravity, and new measurements are weighed by their normalised innovation squared. The samples between two knots are integrated
+once, and again where a measurement divides them, where samples arrive late, or where the bias of the gyro moves. The start needs
+no pose: docs/explanation/imu.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+from tsgt.geometry.inertial.bordered import BorderedCholesky, factorise_bordered
+from tsgt.geometry.inertial.factors import (
+    InertialAnchor,
+    InertialEquations,
+    InertialFactors,
+    assemble_inertial,
+)
+from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
+from tsgt.geometry.inertial.prediction import StrapdownPredictor
+from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
+from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
+from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
+from tsgt.geometry.inertial.smoother import estimation_noise
+from tsgt.geometry.inertial.solver import (
+    MAX_BIAS_ROTATION_RAD,
+    MAX_KNOT_SPACING_S,
+    InertialSetup,
+    InertialSolution,
+    apply_linear_step,
+    diffuse_inertial_prior,
+    inertial_knot_times,
+    solve_inertial,
+)
+from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
+from tsgt.geometry.rigid import dot
+from tsgt.geometry.trajectory.gauss_newton import (
+    MAX_ITERATIONS,
+    MIN_KNOT_SPACING_S,
+    OUTLIER_THRESHOLD,
+    add_measurements,
+    nearest_knots,
+)
+from tsgt.geometry.trajectory.measurement_window import (
+    COST_TOLERANCE,
+    MAX_STEPS,
+    MeasurementWindow,
+    is_below_step_tolerance,
+    merge_observations,
+    normalised_innovations,
+    time_order,
+)
+from tsgt.geometry.trajectory.motion_prior import transition
+from tsgt.geometry.trajectory.states import States, concatenate_states
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory.measurement_factors import Observations
+    from tsgt.model import ImuParameters, MotionPrior
+
+SEARCH_S = 40.0  # Longest stretch of measurements that the search over headings takes
+SEARCH_GROWTH = (
+    1.15  # Of that stretch from one search to the next: the search takes as long as twenty updates
+)
+MIN_SEARCH_STEP_S = 0.5
+MIN_PATH_M = 0.3  # Of a single prism: without motion it does not tell the heading
+MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
+SAMPLES_MARGIN_S = 0.5  # Before the oldest knot: the sample before a knot tells where the next one begins
+
+_DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0], 3)
+"""Sigmas of position, rotation and velocity of the first state's error, once measurements determine it: as without an IMU."""
+
+_POSE_DIM = 6
+
+
+class InertialFixedLagSmoother(MeasurementWindow):
+    """Estimates the trajectory of a robot online, from measurements of any number of prisms and the samples of its IMU.
+
+    ``observations`` have the layout in the axes of the robot from a reference point, whose states it gives.
+    ``reliable_from_s``: each prism must have been measured twice; the first measurement, with nothing to contradict it, may be
+    of a wrong prism.
+    """
+
+    def __init__(
+        self, imu: ImuParameters, prior: MotionPrior, *, reference_m: FloatArray, gyro_only: bool = False
+    ) -> None:
+        super().__init__()
+        self._noise = estimation_noise(imu.noise)
+        mounting = Mounting.of(imu, reference_m)
+        self._mounting = replace(mounting, position=np.zeros(3)) if gyro_only else mounting
+        self._prior, self._gyro_only = prior, prior if gyro_only else None
+        self._initial_gravity = self._gravity = Gravity.of(imu)
+        self._samples: InertialSamples | None = None
+        self._stale_from_s = np.inf  # Samples after this have arrived since the integration
+        self._window: _Window | None = None
+        self._factor: BorderedCholesky | None = None
+        self._trajectory: WindowTrajectory | None = None
+        self._predictor: StrapdownPredictor | None = None
+        self._searched: Observations | None = None  # Also those before the horizon, while there is no start
+        self._next_search_s = -np.inf
+
+    @property
+    def initialised(self) -> bool:
+        """Whether there is a trajectory."""
+        return self._predictor is not None
+
+    def add_samples(self, new: InertialSamples) -> None:
+        """Add samples, in the order of time; they may precede others that were added before."""
+        if not len(new):
+            return
+        held, self._samples = self._samples, new
+        if held is not None and len(held):
+            self._samples = concatenate_samples([held, new])
+            if new.end_s[0] <= held.end_s[-1]:
+                order = np.argsort(self._samples.end_s, kind="stable")
+                ends_s = self._samples.end_s[order]
+                # The first of two of the same interval.
+                self._samples = self._samples.select(order[np.diff(ends_s, prepend=-np.inf) > 0])
+        # The gap before the first of them ends there.
+        previous = int(np.searchsorted(self._samples.end_s, new.end_s[0])) - 1
+        from_s = float(self._samples.end_s[previous]) if previous >= 0 else -np.inf
+        self._stale_from_s = min(self._stale_from_s, from_s)
+        if self._predictor is not None:
+            self._predictor.discard_after(from_s)
+
+    def marginalise_before(self, before_s: float) -> None:
+        """Marginalise the states before a time; states from then on can still be queried."""
+        super().marginalise_before(before_s)
+        if self._converged:
+            assert self._window is not None  # noqa: S101 (converged)
+            if before_s - self._window.knots.time_s[-1] > MAX_OUTAGE_S:
+                self._converged = False
+                self._discard_trajectory()
+            else:
+                before_s = float(self._window.knots.time_s[0])
+        elif self._searched is not None:
+            before_s -= SEARCH_S
+            self._searched = self._searched.select(self._searched.time_s >= before_s)
+        if self._samples is not None:
+            # A trajectory that is lost still predicts.
+            from_s = before_s if self._predictor is None else min(before_s, self._predictor.time_s)
+            self._samples = self._samples.select(self._samples.end_s >= from_s - SAMPLES_MARGIN_S)
+
+    def predict(self, time_s: float, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
+        """Return the state at a time, given all so far, and the (1, 6, 6) covariance of its pose.
+
+        Beyond the newest knot the samples are integrated, and beyond the last one the motion prior goes on; the newest NIS
+        scales the covariance.
+        """
+        assert self._predictor is not None  # noqa: S101 (only called while initialised)
+        if time_s >= self._predictor.time_s:
+            return self._predict(time_s, dim)
+        return self.trajectory().at(np.array([time_s]), dim=dim)
+
+    def _predict(self, time_s: float, dim: int) -> tuple[States, FloatArray]:
+        assert self._predictor is not None  # noqa: S101 (only called while initialised)
+        assert self._samples is not None  # noqa: S101 (initialised)
+        state, covariance = self._predictor.at(time_s, self._samples)
+        return state, covariance[:, :dim, :dim] * self._prediction_scale()
+
+    def trajectory(self) -> WindowTrajectory:
+        """Return the trajectory over the window and over what the last :meth:`marginalise_before` eliminated."""
+        if self._trajectory is None:
+            assert self._window is not None  # noqa: S101 (only called while initialised)
+            assert self._factor is not None  # noqa: S101 (likewise)
+            self._trajectory = WindowTrajectory(
+                InertialTrajectory(
+                    self._window.knots,
+                    self._gravity,
+                    self._contiguous(self._window.knots.time_s),
+                    self._mounting,
+                    *self._factor.marginals(),
+                    self._gyro_only,
+                ),
+                self._predict,
+            )
+        return self._trajectory
+
+    def common_at(self, time_s: float, *, dim: int = _POSE_DIM) -> FloatArray | None:  # noqa: ARG002
+        """Return the (1, 6, 6) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""
+        return None
+
+    def _discard_trajectory(self) -> None:
+        self._window, self._factor, self._predictor, self._trajectory = None, None, None, None
+
+    def _mounted(self, observations: Observations) -> Observations:
+        return replace(observations, layout=self._mounting.in_imu(observations.layout))
+
+    def _contiguous(self, knots_s: FloatArray) -> ContiguousSamples:
+        """Return the samples from the first knot to the last; a knot alone needs some too."""
+        assert self._samples is not None  # noqa: S101 (there are knots)
+        start_s, end_s = float(knots_s[0]), float(knots_s[-1])
+        first, stop = np.searchsorted(self._samples.end_s, (start_s, end_s))
+        # One more at each end: where the first one begins, and what comes after the last knot.
+        some = self._samples.select(slice(max(int(first) - 1, 0), int(stop) + 1))
+        return contiguous(some, self._noise, start_s=start_s, end_s=end_s)
+
+    def update(self, new: Observations) -> None:
+        """Process measurements, in the order of time, none before :attr:`horizon_s`."""
+        if not self._converged:
+            self._searched = merge_observations(self._searched, new)
+        super().update(new)
+        if self._converged:
+            self._searched = None
+        elif self._searched is None:
+            self._searched = self.observations
+
+    def _initialise(self, observations: Observations) -> None:
+        self._converged, self._newest_nis = False, 0.0
+        self._monitor.reset(observations)
+        self._discard_trajectory()
+        searched = observations if self._searched is None else self._searched
+        found = self._search(searched)
+        knots = found.knots
+        prior = diffuse_inertial_prior(knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only)
+        sigmas = np.diag(prior.information) ** -0.5
+        sigmas[:9] = _DIFFUSE_SIGMAS
+        anchor = replace(prior, information=np.diag(sigmas**-2.0))
+        setup = InertialSetup(self._contiguous(knots.time_s), self._noise, self._gyro_only)
+        self._window = _Window(knots, found.factors, setup.samples.at(knots.time_s), anchor, setup.samples)
+        # Without measurements before the horizon, which the start needed.
+        held = searched.time_s >= self._horizon_s
+        first = int(found.knot_index[held][0])
+        outliers = self._accept(found.gravity, found.factor, found)[held]
+        if self._converged:
+            if first > 0:
+                self._eliminate(searched, found.knot_index, first, ~held)
+            self.residuals_m = self.residuals_m[-len(observations) :]
+            self._monitor.set_start(float(observations.time_s[-1]))
+            self._reliable_from_s = _measured_twice_s(observations.select(~outliers))
+        else:
+            raise GeometryError("the measurements do not determine the trajectory")
+
+    def _search(self, observations: Observations) -> InertialSolution:
+        """Find the trajectory of measurements without any prior knowledge."""
+        newest_s = float(observations.time_s[-1])
+        if self._samples is None or newest_s < self._next_search_s:
+            raise GeometryError("no samples of the IMU, or too little measured since the last search")
+        # Before the first sample nothing links the measurements.
+        with_samples = observations.time_s >= self._samples.end_s[0] - self._samples.duration_s[0]
+        if not with_samples.all():
+            raise GeometryError("measurements precede the samples of the IMU")
+        if len(observations) < MIN_MEASUREMENTS:
+            raise GeometryError("too few measurements")
+        if len(np.unique(observations.prism)) == 1 and _path_m(observations) < MIN_PATH_M:
+            raise GeometryError("one prism alone tells the heading of a robot only in motion")
+        length_s = newest_s - float(observations.time_s[0])
+        self._next_search_s = newest_s + max(MIN_SEARCH_STEP_S, (SEARCH_GROWTH - 1.0) * length_s)
+        mounted = self._mounted(observations)
+        setup = InertialSetup(
+            self._contiguous(inertial_knot_times(observations.time_s)), self._noise, self._gyro_only
+        )
+        found = search_heading(mounted, setup, self._initial_gravity)
+        if not found.determined:
+            raise GeometryError("the measurements do not tell the heading of the robot")
+        start = found.solution
+        return solve_inertial(mounted, setup, start.knots, start.gravity, factors=start.factors)
+
+    def _update_tracked(self, held: Observations, new: Observations) -> bool:
+        assert self._window is not None  # noqa: S101 (converged)
+        assert self.observations is not None  # noqa: S101 (converged)
+        if self._window.knots.time_s[0] - new.time_s[0] > 0.5 * MIN_KNOT_SPACING_S:
+            return False  # in the first window, earlier than all others
+        self._window = self._window_with(new.time_s)
+        window, observations = self._window, self._mounted(self.observations)
+        knot_index = nearest_knots(window.knots.time_s, observations.time_s)
+        is_new = time_order(held, new) >= len(held)
+        knots, gravity = window.knots, self._gravity
+
+        def assembled(active: NDArray[np.bool_] | None) -> InertialEquations:
+            return window.assemble(
+                observations, knot_index, knots, gravity, rejectable=~is_new, active=active
+            )
+
+        system = assembled(~is_new)
+        factor = _factorise(system)
+
+        def solve_system(rhs: FloatArray) -> FloatArray:
+            shared = np.zeros((len(system.corner_gradient), rhs.shape[2]))
+            shared[:, -1] = -system.corner_gradient
+            return factor.solve(rhs, shared)[0]
+
+        nis, sequential_nis = normalised_innovations(
+            system.whitened[is_new], knot_index[is_new], system.gradient, solve_system
+        )
+        weights = self._weigh(nis, sequential_nis)
+        add_measurements(
+            system.whitened[is_new], weights, knot_index[is_new], system.diagonal, system.gradient
+        )
+        for _ in range(MAX_STEPS):
+            factor = _factorise(system)
+            step, tilt = factor.solve(-system.gradient, -system.corner_gradient)
+            gain = -float(np.vdot(step, system.gradient) + np.vdot(tilt, system.corner_gradient))
+            knots, gravity = knots.retract(step), replace(gravity, tilt=gravity.tilt + tilt)
+            if gain < COST_TOLERANCE or (np.all(weights == 1.0) and is_below_step_tolerance(step)):
+                self._window = replace(window, knots=knots)
+                outliers = self._accept(gravity, factor, apply_linear_step(system, knot_index, step, gain))
+                break
+            system = assembled(None)
+        else:
+            found = solve_inertial(
+                observations,
+                InertialSetup(window.samples, self._noise, self._gyro_only),
+                knots,
+                gravity,
+                anchor=window.anchor,
+                factors=window.factors,
+            )
+            self._window = replace(window, knots=found.knots, factors=found.factors)
+            outliers = self._accept(found.gravity, found.factor, found)
+            self._converged &= found.iterations < MAX_ITERATIONS
+        self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
+        return self._converged
+
+    def _window_with(self, time_s: FloatArray) -> _Window:
+        """Return the window with knots at measurement times that have none nearby, and with the samples that have arrived."""
+        assert self._window is not None  # noqa: S101 (converged)
+        window = self._window
+        knots, old_s = window.knots, window.knots.time_s
+        added = [each for each in time_s.tolist() if np.abs(old_s - each).min() > 0.5 * MIN_KNOT_SPACING_S]
+        times_s = old_s
+        for each in added:
+            if np.abs(times_s - each).min() > 0.5 * MIN_KNOT_SPACING_S:
+                times_s = np.sort(np.append(times_s, each))
+        if added and times_s[-1] - old_s[-1] > MAX_KNOT_SPACING_S:
+            times_s = np.concatenate([old_s[:-1], _divided(times_s[len(old_s) - 1 :])])
+        samples = self._contiguous(times_s)
+        # The states of the knots before; those of new ones are propagated below.
+        nearest = np.searchsorted(old_s, times_s, side="right") - 1
+        guess = replace(knots.select(nearest), time_s=times_s)
+        factors = self._factors_of(window, guess, samples)
+        for row in np.flatnonzero(old_s[nearest] != times_s).tolist():
+            _propagate(guess, row, factors, self._gravity, self._gyro_only)
+        self._stale_from_s = np.inf
+        return _Window(guess, factors, samples.at(times_s), window.anchor, samples)
+
+    def _factors_of(
+        self, window: _Window, knots: InertialStates, samples: ContiguousSamples
+    ) -> InertialFactors:
+        """Factors between knots: those of the window where neither knots nor samples nor the gyro's bias have changed."""
+        old, old_s, times_s = window.factors, window.knots.time_s, knots.time_s
+        row = np.searchsorted(old_s, times_s[:-1])
+        row[row >= len(old)] = 0
+        kept = np.zeros(len(times_s) - 1, np.bool_)
+        if len(old):
+            kept = (old_s[row] == times_s[:-1]) & (old_s[row + 1] == times_s[1:])
+            kept &= times_s[1:] <= self._stale_from_s
+            moved = knots.gyro_bias[:-1] - old.preintegrated.gyro_bias[row]
+            kept &= np.sqrt(dot(moved, moved)) * np.diff(times_s) < MAX_BIAS_ROTATION_RAD
+        if kept.all():
+            return old.select(row)
+        changed = np.flatnonzero(~kept)
+        found = InertialFactors.between(
+            samples, knots.select(changed), times_s[changed + 1], self._noise, gyro_only=self._gyro_only
+        )
+        if not kept.any():
+            return found
+        row[changed] = len(old) + np.arange(len(changed))
+        return old.joined(found).select(row)
+
+    def _accept(
+        self, gravity: Gravity, factor: BorderedCholesky, found: InertialEquations | InertialSolution
+    ) -> NDArray[np.bool_]:
+        """Make a solution the trajectory; return which measurements are outliers."""
+        assert self._window is not None  # noqa: S101 (it was solved)
+        self._gravity, self._factor, self._trajectory = gravity, factor, None
+        self.residuals_m = found.linearised.residuals_m
+        covariance = factor.last_covariance()
+        self._predictor = StrapdownPredictor(
+            self._window.knots.select(slice(-1, None)),
+            covariance,
+            gravity,
+            self._noise,
+            self._mounting,
+            self._prior,
+            gyro_only=self._gyro_only is not None,
+        )
+        return self._check(found.squared_distances, covariance[3:6, 3:6])
+
+    def _eliminate_before(self, before_s: float) -> None:
+        assert self._window is not None  # noqa: S101 (converged)
+        assert self.observations is not None  # noqa: S101 (converged)
+        knots_s = self._window.knots.time_s
+        first = int(np.searchsorted(knots_s, before_s, side="right")) - 1
+        if first <= 0:
+            return
+        knot_index = nearest_knots(knots_s, self.observations.time_s)
+        is_past = knot_index < first
+        self._eliminate(self.observations, knot_index, first, is_past)
+        self._horizon_s = float(self._window.knots.time_s[0])
+        self._select(~is_past)
+
+    def _eliminate(
+        self, observations: Observations, knot_index: NDArray[np.intp], first: int, is_past: NDArray[np.bool_]
+    ) -> None:
+        """Marginalise the knots before one, and measurements, into an anchor prior on it."""
+        assert self._window is not None  # noqa: S101 (converged)
+        window = self._window
+        system = window.select(slice(first + 1)).assemble(
+            self._mounted(observations.select(is_past)),
+            knot_index[is_past],
+            window.knots.select(slice(first + 1)),
+            self._gravity,
+            rejectable=np.ones(int(is_past.sum()), np.bool_),
+        )
+        factor = _factorise(system)
+        step, tilt = factor.solve(-system.gradient, -system.corner_gradient)
+        anchor = InertialAnchor(
+            window.knots.select(slice(first, first + 1)),
+            self._gravity.tilt,
+            factor.last_information(),
+            np.concatenate([step[first], tilt]),
+        )
+        self._window = replace(window.select(slice(first, None)), anchor=anchor)
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """Knots, the factors between them, and the anchor prior on the first."""
+
+    knots: InertialStates
+    factors: InertialFactors
+    kinematics: tuple[FloatArray, FloatArray]  # Angular rate and specific force at the knots
+    anchor: InertialAnchor
+    samples: ContiguousSamples
+
+    def select(self, rows: slice) -> _Window:
+        """Return some knots, all from the first or all up to the last."""
+        steps = slice(rows.start, None if rows.stop is None else rows.stop - 1)
+        kinematics = self.kinematics[0][rows], self.kinematics[1][rows]
+        return _Window(
+            self.knots.select(rows), self.factors.select(steps), kinematics, self.anchor, self.samples
+        )
+
+    def assemble(
+        self,
+        observations: Observations,
+        knot_index: NDArray[np.intp],
+        knots: InertialStates,
+        gravity: Gravity,
+        *,
+        rejectable: NDArray[np.bool_],
+        active: NDArray[np.bool_] | None = None,
+    ) -> InertialEquations:
+        """Assemble the normal equations at states of the knots."""
+        return assemble_inertial(
+            observations,
+            knot_index,
+            knots,
+            self.kinematics,
+            gravity,
+            self.factors,
+            self.anchor,
+            active=active,
+            rejectable=rejectable,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class WindowTrajectory:
+    """The trajectory of a window, and its prediction beyond the newest knot."""
+
+    inside: InertialTrajectory
+    predict: Callable[[float, int], tuple[States, FloatArray]]
+
+    def at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
+        """Return states of the reference point at N times from the first knot on, and the (N, 6, 6) covariance of poses."""
+        knots_s = self.inside.knots.time_s
+        beyond = time_s > knots_s[-1] if len(knots_s) > 1 else np.ones(len(time_s), np.bool_)
+        parts = []
+        if not beyond.all() or not len(time_s):
+            parts.append(self.inside.at(time_s[~beyond], dim=dim))
+        parts += [self.predict(each, dim) for each in time_s[beyond].tolist()]
+        if len(parts) == 1:
+            return parts[0]
+        order = np.argsort(np.concatenate([np.flatnonzero(~beyond), np.flatnonzero(beyond)]))
+        states = concatenate_states([each for each, _ in parts])
+        return states.select(order), np.concatenate([each for _, each in parts])[order]
+
+    def common_at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> FloatArray | None:
+        """Return the (N, 6, 6) covariance that the set-up's uncertainty adds; None: unknown."""
+        return self.inside.common_at(time_s, dim=dim)
+
+
+def _propagate(
+    states: InertialStates, row: int, factors: InertialFactors, gravity: Gravity, prior: MotionPrior | None
+) -> None:
+    """Set a state, in place, to what follows from the one before."""
+    start, motion = states.select(slice(row - 1, row)), factors.preintegrated.select(slice(row - 1, row))
+    if prior is None:
+        found = strapdown(start, gravity, motion)
+        states.position[row] = found.position[0]
+        states.rotation[row] = found.rotation[0]
+        states.velocity[row] = found.velocity[0]
+        states.bias_or_acceleration[row] = start.bias_or_acceleration[0]
+    else:
+        phi = transition(motion.duration_s, np.array(prior.acceleration_correlation_time_s))[0]
+        axes = np.concatenate([start.position, start.velocity, start.bias_or_acceleration])
+        moved = phi @ axes
+        states.position[row], states.velocity[row], states.bias_or_acceleration[row] = moved
+        states.rotation[row] = start.rotation[0] @ motion.rotation[0]
+    states.gyro_bias[row] = start.gyro_bias[0]
+
+
+def _factorise(system: InertialEquations) -> BorderedCholesky:
+    return factorise_bordered(system.diagonal, system.off_diagonal, system.border, system.corner)
+
+
+def _divided(times_s: FloatArray) -> FloatArray:
+    """Insert times so that none is further than the largest spacing from the next."""
+    steps = np.ceil(np.diff(times_s) / MAX_KNOT_SPACING_S - 1e-9).astype(np.int64)
+    parts = [
+        times_s[i] + (times_s[i + 1] - times_s[i]) * np.arange(count) / count
+        for i, count in enumerate(steps.tolist())
+    ]
+    return np.concatenate([*parts, times_s[-1:]])
+
+
+def _path_m(observations: Observations) -> float:
+    """Largest distance of the measured points from the first."""
+    points = observations.in_world()
+    return float(np.linalg.norm(points - points[0], axis=1).max())
+
+
+def _measured_twice_s(observations: Observations) -> float:
+    """Time from which each prism has been measured twice, of those that have."""
+    times_s = [observations.time_s[observations.prism == prism] for prism in np.unique(observations.prism)]
+    return float(max((each[1] for each in times_s if len(each) > 1), default=observations.time_s[-1]))

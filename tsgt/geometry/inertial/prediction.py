@@ -1,0 +1,221 @@
+"""Prediction of the robot's motion beyond the newest knot: strapdown with the samples present, then the motion prior. Sans-I/O.
+
+The state and its covariance are kept a quarter of a second apart, so that a prediction integrates few samples however long
+nothing has been measured. Beyond the last sample the robot goes on with the angular rate and the acceleration of the last
+samples, as the motion prior says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
+from tsgt.geometry.inertial.query import strapdown
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM
+from tsgt.geometry.rigid import IDENTITY, FloatArray, matvec, skew
+from tsgt.geometry.trajectory.motion_prior import process_noise, transition
+from tsgt.geometry.trajectory.propagation import Propagator
+from tsgt.geometry.trajectory.states import STATE_DIM, States
+
+if TYPE_CHECKING:
+    from tsgt.geometry.inertial.preintegration import Preintegrated
+    from tsgt.geometry.inertial.samples import InertialSamples
+    from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
+    from tsgt.model import ImuNoise, MotionPrior
+
+LINK_S = 0.25  # Between states that are kept
+RATE_SPAN_S = 0.03
+ACCELERATION_SPAN_S = 0.1
+"""Samples whose mean goes on beyond the last one: shaking of 8 to 60 Hz averages out, steering does not."""
+SHAKING_RATE_RADPS, SHAKING_ACCELERATION_MPS2 = 0.05, 1.0
+"""One sigma of those means about the motion that goes on, from shaking."""
+PREDICTION_NOISE_SCALE = 2.0  # On the variances of the motion prior, as without an IMU
+
+_DIM = INERTIAL_STATE_DIM + TILT_DIM
+_POSE_DIM = 6
+
+
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """A predicted state; errors are those of the state and of the tilt."""
+
+    state: InertialStates  # One
+    covariance: FloatArray  # (17, 17)
+    by_start: FloatArray  # (17, 17) by the error of the newest knot
+
+    @property
+    def time_s(self) -> float:
+        return float(self.state.time_s[0])
+
+
+class StrapdownPredictor:
+    """Predicts from one state of the IMU, with the (17, 17) covariance of its error and of the tilt's.
+
+    ``motion`` is the prior beyond the last sample; ``gyro_only``: for positions everywhere.
+    """
+
+    def __init__(
+        self,
+        start: InertialStates,
+        covariance: FloatArray,
+        gravity: Gravity,
+        noise: ImuNoise,
+        mounting: Mounting,
+        motion: MotionPrior,
+        *,
+        gyro_only: bool = False,
+    ) -> None:
+        self._links = [_Link(start, covariance, np.eye(_DIM))]
+        self._gravity, self._noise, self._mounting, self._motion = gravity, noise, mounting, motion
+        self._gyro_only = gyro_only
+
+    @property
+    def time_s(self) -> float:
+        """Time of the state from which it predicts."""
+        return self._links[0].time_s
+
+    def discard_after(self, time_s: float) -> None:
+        """Forget what was predicted beyond a time: samples there were missing."""
+        self._links[1:] = [link for link in self._links[1:] if link.time_s <= time_s]
+
+    def at(self, time_s: float, samples: InertialSamples) -> tuple[States, FloatArray]:
+        """State of the reference point and the robot's axes, and the (1, 6, 6) covariance of its pose.
+
+        ``samples``: those present, at least from the start on and at least one.
+        """
+        end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
+        link = self._at(end_s, samples)
+        state, by_error = self._reference_state(link.state, samples, beyond=time_s > end_s)
+        covariance = by_error @ link.covariance @ by_error.T
+        if time_s > end_s:
+            covariance[9:12, 9:12] += SHAKING_RATE_RADPS**2 * IDENTITY
+            covariance[12:15, 12:15] += SHAKING_ACCELERATION_MPS2**2 * IDENTITY
+            covariance[15:18, 15:18] += np.diag(np.array(self._motion.angular_acceleration_sigma_radps2) ** 2)
+            onward = Propagator(state, covariance, self._motion, process_noise_scale=PREDICTION_NOISE_SCALE)
+            return onward.at(time_s, dim=_POSE_DIM)
+        covariance = covariance[:_POSE_DIM, :_POSE_DIM]
+        return state, 0.5 * (covariance + covariance.T)[None]
+
+    def _at(self, end_s: float, samples: InertialSamples) -> _Link:
+        """Predict to a time up to the last sample, and keep states on the way."""
+        while self._links[-1].time_s + LINK_S <= end_s:
+            last = self._links[-1]
+            self._links.append(self._onward(last, last.time_s + LINK_S, samples))
+        number = min(int((end_s - self.time_s) / LINK_S), len(self._links) - 1)
+        link = self._links[number]
+        return link if link.time_s == end_s else self._onward(link, end_s, samples)
+
+    def _onward(self, link: _Link, end_s: float, samples: InertialSamples) -> _Link:
+        """Predict from one state to a later time, by samples up to then at least."""
+        first = int(np.searchsorted(samples.end_s, link.time_s, side="right"))
+        stop = int(np.searchsorted(samples.end_s, end_s)) + 1
+        # The sample before tells where the first one begins.
+        some = samples.select(slice(max(first - 1, 0), stop))
+        present = contiguous(some, self._noise, start_s=link.time_s, end_s=end_s)
+        state = link.state
+        bias = np.zeros(3) if self._gyro_only else state.bias_or_acceleration
+        motion = preintegrate(present, state.time_s, np.array([end_s]), state.gyro_bias, bias)
+        moved, by_link, noise = (self._turned if self._gyro_only else self._integrated)(state, motion)
+        step_s = end_s - link.time_s
+        walks = [self._noise.gyro_bias_walk, 0.0 if self._gyro_only else self._noise.accelerometer_bias_walk]
+        np.einsum("ii->i", noise)[9:15] += np.repeat(np.square(walks) * step_s, 3)
+        return _Link(
+            replace(moved, time_s=np.array([end_s])),
+            by_link @ link.covariance @ by_link.T + noise,
+            by_link @ link.by_start,
+        )
+
+    def _integrated(
+        self, state: InertialStates, motion: Preintegrated
+    ) -> tuple[InertialStates, FloatArray, FloatArray]:
+        """State after a motion, Jacobian of its error, and covariance of the samples' noise, (17, 17) each."""
+        found = strapdown(state, self._gravity, motion)
+        step_s = float(motion.duration_s[0])
+        by_start, noise = np.eye(_DIM), np.zeros((_DIM, _DIM))
+        by_start[0:9, :INERTIAL_STATE_DIM] = found.by_start[0]
+        by_tilt = self._gravity.by_tilt()
+        by_start[0:3, INERTIAL_STATE_DIM:] = 0.5 * step_s**2 * by_tilt
+        by_start[6:9, INERTIAL_STATE_DIM:] = step_s * by_tilt
+        noise[0:9, 0:9] = found.noise[0]
+        moved = replace(state, position=found.position, rotation=found.rotation, velocity=found.velocity)
+        return moved, by_start, noise
+
+    def _turned(
+        self, state: InertialStates, motion: Preintegrated
+    ) -> tuple[InertialStates, FloatArray, FloatArray]:
+        """As with an accelerometer: rotation by the gyro, position by the motion prior."""
+        prior, step_s = self._motion, motion.duration_s
+        time_s = np.array(prior.acceleration_correlation_time_s)
+        phi = transition(step_s, time_s)[0]
+        axes = np.stack([np.zeros(3), state.velocity[0], state.bias_or_acceleration[0]])
+        moved = phi @ axes
+        by_start, noise = np.eye(_DIM), np.zeros((_DIM, _DIM))
+        by_start[3:6, 3:6] = motion.rotation[0].T
+        by_start[3:6, 9:12] = motion.by_gyro_bias[0, 3:6]
+        noise[3:6, 3:6] = motion.covariance[0, 3:6, 3:6]
+        rows = np.array([0, 6, 12])
+        of_prior = PREDICTION_NOISE_SCALE * process_noise(step_s, time_s)[0]
+        for axis, sigma in enumerate(prior.acceleration_sigma_mps2):
+            block = np.ix_(rows + axis, rows + axis)
+            by_start[block], noise[block] = phi, sigma**2 * of_prior
+        return (
+            replace(
+                state,
+                position=state.position + moved[0],
+                rotation=state.rotation @ motion.rotation,
+                velocity=moved[None, 1],
+                bias_or_acceleration=moved[None, 2],
+            ),
+            by_start,
+            noise,
+        )
+
+    def _reference_state(
+        self, state: InertialStates, samples: InertialSamples, *, beyond: bool
+    ) -> tuple[States, FloatArray]:
+        """State of the reference point, with rate and acceleration by the last samples, and its Jacobian, (18, 17).
+
+        ``beyond``: to go on with it, from the means over some time.
+        """
+        last = int(np.searchsorted(samples.end_s, state.time_s[0] + 1e-9, side="right"))
+        spans_s = (RATE_SPAN_S, ACCELERATION_SPAN_S) if beyond else (0.0, 0.0)
+        rate, force = (
+            values[
+                min(int(np.searchsorted(samples.end_s, state.time_s[0] - span_s)), max(last - 1, 0)) : max(
+                    last, 1
+                )
+            ].mean(axis=0)
+            for values, span_s in zip(
+                (samples.angular_rate_radps, samples.specific_force_mps2), spans_s, strict=True
+            )
+        )
+        rate = rate - state.gyro_bias[0]
+        rotation, arm = state.rotation[0], self._mounting.in_imu(np.zeros(3))
+        turning = np.cross(rate, arm)
+        if self._gyro_only:
+            acceleration = state.bias_or_acceleration[0]
+        else:
+            acceleration = matvec(rotation, force - state.bias_or_acceleration[0]) + self._gravity.vector()
+        to_robot = self._mounting.rotation
+        by_error = np.zeros((STATE_DIM, _DIM))
+        by_error[0:3, 0:3] = by_error[6:9, 6:9] = IDENTITY
+        by_error[0:3, 3:6] = -rotation @ skew(arm)
+        by_error[3:6, 3:6] = to_robot
+        by_error[6:9, 3:6] = -rotation @ skew(turning)
+        by_error[6:9, 9:12] = rotation @ skew(arm)
+        by_error[9:12, 9:12] = -to_robot
+        if self._gyro_only:
+            by_error[12:15, 12:15] = IDENTITY
+        found = States(
+            state.time_s,
+            state.position + matvec(rotation, arm),
+            state.rotation @ to_robot.T,
+            state.velocity + matvec(rotation, turning),
+            (to_robot @ rate)[None],
+            (acceleration + matvec(rotation, np.cross(rate, turning)))[None],
+            np.zeros((1, 3)),
+        )
+        return found, by_error

@@ -33,6 +33,8 @@ ARCSECOND_RAD = math.pi / 648_000
 
 MAX_INSTANT_NS = 2**63 - 1  # times are signed 64-bit integers, which end in 2262
 
+MIN_PRISMS = 3  # that determine a pose without an IMU
+
 MAX_NUMBER = 2**31 - 1  # of stations and prisms
 
 MAX_COORDINATE_M = 1e8  # map coordinates (UTM: 1e7) and geocentric coordinates are smaller

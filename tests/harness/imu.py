@@ -21,7 +21,7 @@ def samples(first: int, count: int, host_ns: int | None = None, **changes: Any) 
         "counter": list(numbers),
         "instrument_time_ns": [DEVICE_START_NS + number * PERIOD_NS for number in numbers],
         # Noise-free values would be stuck ones.
-        "angular_rate_radps": [[1e-6 * number, 0.0, 0.1] for number in numbers],
+        "angular_rate_radps": [[1e-6 * number, 0.0, 0.01] for number in numbers],
         "specific_force_mps2": [[0.0, 0.0, 9.81] for _ in numbers],
     }
     if host_ns is not None:

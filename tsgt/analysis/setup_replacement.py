@@ -47,7 +47,9 @@ def with_layout(parameters: Parameters, layout: PrismLayout, *, path: Path) -> P
         raise ConfigError(f"{path}: prisms.{missing[0]}: missing; the recording has this prism", path=path)
     numbers = [p.prism for p in parameters.prisms]
     try:
-        check_layout([positions_m[number] for number in numbers], names=numbers)
+        check_layout(
+            [positions_m[number] for number in numbers], names=numbers, imu=parameters.imu is not None
+        )
     except DegenerateGeometryError as error:
         raise ConfigError(f"{path}: {error}", path=path, key="prisms") from error
     known = parameters.setup_covariance

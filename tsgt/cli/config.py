@@ -30,7 +30,7 @@ from tsgt.config import (
 )
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.geometry import check_layout
-from tsgt.model import Parameters, PrismPosition
+from tsgt.model import MIN_PRISMS, Parameters, PrismPosition
 from tsgt.radio.from_config import lora_settings
 
 if TYPE_CHECKING:
@@ -92,9 +92,9 @@ def _problems_at_start(file: Path, content: Model) -> list[ConfigError]:
     """Return what keeps a daemon from starting although the file itself is valid."""
     problems: list[ConfigError] = []
 
-    def attempt(step: Callable[..., object], *arguments: Any) -> None:
+    def attempt(step: Callable[..., object], *arguments: Any, **options: Any) -> None:
         try:
-            step(*arguments)
+            step(*arguments, **options)
         except ConfigError as problem:
             problems.append(problem)
 
@@ -110,22 +110,33 @@ def _problems_at_start(file: Path, content: Model) -> list[ConfigError]:
                 problems += find_problems(path)[1]
                 attempt(check_permissions, path)
             if len(problems) == before:
-                attempt(lambda: _check_layout(content.setup.prism_layout, parameters(content).prisms))
+                attempt(_check_master, file, content)
         case ScenarioConfig():
-            attempt(_check_layout, file, scenario_parameters(content).prisms)
+            prisms = scenario_parameters(content).prisms
+            attempt(_check_layout, file, prisms, imu=content.imu.model != "none")
         case PrismLayoutFile():
-            prisms = [
+            positions = [
                 PrismPosition(prism=int(number), position_m=entry.position_m)
                 for number, entry in content.prisms.items()
             ]
-            attempt(_check_layout, file, tuple(prisms))
+            attempt(_check_layout, file, tuple(positions), imu=len(positions) < MIN_PRISMS)
     return problems
 
 
-def _check_layout(path: Path, prisms: tuple[PrismPosition, ...]) -> None:
+def _check_master(file: Path, config: MasterConfig) -> None:
+    try:
+        known = parameters(config)
+    except ConfigError as error:
+        if error.path is None:
+            raise ConfigError(f"{file}: {error}", path=file, key=error.key) from error
+        raise
+    _check_layout(config.setup.prism_layout, known.prisms, imu=known.imu is not None)
+
+
+def _check_layout(path: Path, prisms: tuple[PrismPosition, ...], *, imu: bool) -> None:
     names = [prism.prism for prism in prisms]
     try:
-        check_layout(np.array([prism.position_m for prism in prisms]).reshape(-1, 3), names=names)
+        check_layout(np.array([prism.position_m for prism in prisms]).reshape(-1, 3), names=names, imu=imu)
     except GeometryError as error:
         raise ConfigError(f"{path}: prisms: {error}", path=path, key="prisms") from error
 
@@ -152,7 +163,8 @@ def _summary(content: Model) -> dict[str, Any]:
             known = scenario_parameters(content)
             return {**_numbers(known), "name": content.name, "duration_s": content.duration_s}
         case PrismLayoutFile():
-            return {"prisms": [int(number) for number in content.prisms]}
+            prisms = [int(number) for number in content.prisms]
+            return {"prisms": prisms, **({"needs": "an IMU"} if len(prisms) < MIN_PRISMS else {})}
         case StationFramesFile():
             return {"stations": [int(number) for number in content.stations]}
         case ImuMountingFile():
@@ -177,6 +189,7 @@ def _numbers(known: Parameters) -> dict[str, Any]:
         "prisms": [prism.prism for prism in known.prisms],
         "estimator": known.pipeline.estimator,
         "rate_hz": 1e9 / known.pipeline.period_ns,
+        **({} if known.imu is None else {"imu": known.imu.name}),
     }
 
 

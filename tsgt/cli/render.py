@@ -12,6 +12,7 @@ from tsgt.recording import (
     ClockRecord,
     EventRecord,
     HelloRecord,
+    ImuStatus,
     PoseRecord,
     StationStatus,
     StatusRecord,
@@ -125,8 +126,15 @@ def _clock(clock: ClockRecord) -> str:
 
 
 def _status(status: StatusRecord) -> str:
-    stations = "; ".join(map(_station, status.stations))
-    return f"{clock_time(status.stamp_ns)}  status  {status.valid_poses} of {status.poses} poses valid; {stations}"
+    parts = [*map(_station, status.stations), *([] if status.imu is None else [_imu(status.imu)])]
+    return f"{clock_time(status.stamp_ns)}  status  {status.valid_poses} of {status.poses} poses valid; {'; '.join(parts)}"
+
+
+def _imu(imu: ImuStatus) -> str:
+    parts = [f"{imu.samples} samples", *imu.figures()]
+    if imu.age_s is not None:
+        parts.append(f"last {_age(imu.age_s)} ago")
+    return f"IMU: {', '.join(parts)}"
 
 
 def _station(station: StationStatus) -> str:

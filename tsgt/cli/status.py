@@ -17,7 +17,7 @@ from tsgt.cli.output import CHECK_FAILED, printable
 from tsgt.cli.render import clock_time
 from tsgt.errors import StreamError
 from tsgt.model import Status
-from tsgt.recording import HelloRecord, StationStatus, StatusRecord, Typed, decode
+from tsgt.recording import HelloRecord, ImuStatus, StationStatus, StatusRecord, Typed, decode
 from tsgt.station import ClientStatus
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ TIMEOUT_S = 5.0
 
 MAX_AGE_S = 3.0
 """A station whose last packet or measurement is older needs the operator."""
+
+MAX_IMU_AGE_S = 1.0
 
 MAX_MASTER_AGE_S = 10.0
 """While the master synchronises another station, a client receives nothing for a second or two."""
@@ -65,7 +67,7 @@ def status(socket_path: Path | None, *, as_json: bool) -> int:
     A master reports all its stations, a client its own station.
 
     Exit code 1: no daemon runs. 3: a daemon runs, but action is required: a station is not received or does not track,
-    or no pose is valid.
+    the IMU gives no samples or disagrees with the prisms, or no pose is valid.
     """
     record, line = _request(socket_path)
     text, ok = client_text(record) if isinstance(record, ClientStatus) else master_text(record)
@@ -88,7 +90,45 @@ def master_text(record: StatusRecord) -> tuple[list[str], bool]:
         label, station_ok = station_label(station)
         lines += ["", _headline(f"STATION {station.id}  {label}", ok=station_ok), *_station_lines(station)]
         ok = ok and station_ok
+    if record.imu is not None:
+        label, imu_ok = imu_label(record.imu)
+        lines += ["", _headline(f"IMU  {label}", ok=imu_ok), *_imu_lines(record.imu)]
+        ok = ok and imu_ok
     return lines, ok
+
+
+def imu_label(imu: ImuStatus) -> tuple[str, bool]:
+    """Return the state of the IMU in a word or two, and whether no action is required."""
+    if imu.age_s is None:
+        return "NO SAMPLES YET", False
+    if imu.age_s > MAX_IMU_AGE_S:
+        return f"SILENT {duration(imu.age_s)}", False
+    if imu.problem:
+        return "CHECK IT", False
+    if imu.disagreement:
+        return "DISAGREES WITH THE PRISMS", False
+    return ("NOT IN USE YET" if imu.in_use is False else "OK"), True
+
+
+def _imu_lines(imu: ImuStatus) -> list[str]:
+    rate = "" if imu.rate_hz is None else f"{imu.rate_hz:.1f} Hz  "
+    age = "" if imu.age_s is None else f"last {duration(imu.age_s)}"
+    lines = [*_wrapped(imu.device, "  "), f"  {rate}{age}".rstrip()]
+    if imu.gaps:
+        lines.append(f"  {imu.gaps} gaps, {imu.lost} samples lost")
+    if imu.saturated:
+        lines.append(f"  {imu.saturated} saturated samples")
+    if imu.clock_skew_ppm is not None:
+        lines.append(f"  clock {imu.clock_skew_ppm:+.1f} ppm")
+    if imu.gyro_bias_radps is not None:
+        x, y, z = map(math.degrees, imu.gyro_bias_radps)
+        lines.append(f"  gyro bias {x:+.2f} {y:+.2f} {z:+.2f} deg/s")
+    if imu.accelerometer_bias_mps2 is not None:
+        x, y, z = (1e3 * each for each in imu.accelerometer_bias_mps2)
+        lines.append(f"  acc. bias {x:+.0f} {y:+.0f} {z:+.0f} mm/s^2")
+    for text in (imu.problem, imu.disagreement):
+        lines += _wrapped(text, "  ")
+    return [line for line in lines if line.strip()]
 
 
 def station_label(station: StationStatus) -> tuple[str, bool]:

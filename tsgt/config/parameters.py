@@ -14,6 +14,7 @@ from tsgt.config.calibration import (
 from tsgt.errors import ConfigError
 from tsgt.model import (
     ARCSECOND_RAD,
+    MIN_PRISMS,
     InstrumentNoise,
     Matrix4,
     MotionPrior,
@@ -29,14 +30,12 @@ if TYPE_CHECKING:
     from tsgt.config.pipeline import PipelineConfig
     from tsgt.config.scenario import ScenarioConfig, SimulatedStation
 
-MIN_PRISMS = 3
-
 
 def parameters(config: MasterConfig) -> Parameters:
     """Read the set-up files of a master's configuration and convert everything to SI units.
 
     Prisms that no station tracks are omitted: every pose would wait for them. Raises ConfigError if a set-up file is
-    invalid, a station has no frame, a prism has no position, or the stations track fewer than three prisms.
+    invalid, a station has no frame, a prism has no position, or the stations track fewer than three prisms without an IMU.
     """
     calibration = load_station_calibration(config.setup.station_frames)
     prism_layout = load_prism_layout(config.setup.prism_layout)
@@ -56,11 +55,7 @@ def parameters(config: MasterConfig) -> Parameters:
             )
     tracked = sorted({station.prism for station in config.stations})
     if len(tracked) < MIN_PRISMS:
-        raise ConfigError(
-            f"{config.setup.prism_layout}: a pose needs {MIN_PRISMS} tracked prisms, the stations track {len(tracked)}",
-            path=config.setup.prism_layout,
-            key="prisms",
-        )
+        _check_imu(config, len(tracked))
     mounting = (
         None if config.imu is None or config.imu.mounting is None else load_imu_mounting(config.imu.mounting)
     )
@@ -94,8 +89,33 @@ def parameters(config: MasterConfig) -> Parameters:
     )
 
 
+def _check_imu(config: MasterConfig, prisms: int) -> None:
+    """Raise ConfigError unless the poses of one or two prisms can be computed with an IMU."""
+    setup = f"{_count(len(config.stations), 'station')} on {_count(prisms, 'prism')}"
+    if config.imu is None:
+        raise ConfigError(
+            f"stations: {setup} cannot give poses without an IMU: add the table [imu], or stations until "
+            f"{MIN_PRISMS} prisms are tracked",
+            key="stations",
+        )
+    if config.pipeline.estimator != "continuous":
+        raise ConfigError(
+            f'pipeline.estimator = "{config.pipeline.estimator}": {setup} and an IMU need the estimator "continuous"',
+            key="pipeline.estimator",
+        )
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
-    """Return the parameters of a master in the simulated world: exact set-up and true noise."""
+    """Return the parameters of a master in the simulated world: exact set-up and true noise, but no IMU.
+
+    The prisms of a robot with an IMU are those that a station tracks, as for a master.
+    """
+    tracked = {station.prism for station in scenario.stations}
+    prisms = [each for each in scenario.prisms if scenario.imu.model == "none" or each.prism in tracked]
     return Parameters(
         stations=tuple(
             StationParameters(
@@ -107,7 +127,7 @@ def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
             )
             for station in scenario.stations
         ),
-        prisms=tuple(PrismPosition(prism=p.prism, position_m=p.position_m) for p in scenario.prisms),
+        prisms=tuple(PrismPosition(prism=p.prism, position_m=p.position_m) for p in prisms),
         pipeline=pipeline_parameters(scenario.pipeline),
         reference_point=scenario.reference_point.point(),
     )

@@ -107,6 +107,8 @@ def check_setup(machine: Machine, config: MasterConfig) -> list[Finding]:
         problem = error
     files = {"station_frames": config.setup.station_frames, "prism_layout": config.setup.prism_layout}
     found = []
+    if problem is not None and problem.path not in files.values():
+        found.append(failed("stations", str(problem)))
     for name, path in files.items():
         if problem is not None and problem.path == path:
             found.append(failed(name, str(problem)))
@@ -127,6 +129,7 @@ def _check_layout(config: MasterConfig) -> None:
         check_layout(
             np.array([prism.position_m for prism in prisms]).reshape(-1, 3),
             names=[each.prism for each in prisms],
+            imu=config.imu is not None,
         )
     except GeometryError as error:
         path = config.setup.prism_layout

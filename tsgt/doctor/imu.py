@@ -14,12 +14,17 @@ if TYPE_CHECKING:
     from tsgt.config import ImuConfig
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine
-    from tsgt.model import ImuSamples
+    from tsgt.model import ImuSamples, Vector3
 
 DURATION_S = 8.0  # the rate and the plausibility of the values are judged after 5 s of samples
 
 GRAVITY_TOLERANCE_MPS2 = 0.2
 """An uncalibrated accelerometer is off by 20 to 50 mg; more is another unit or a removed gravity."""
+
+BIAS_SIGMAS = 6.0
+"""The mean rate at rest is the bias. A device that gives degrees exceeds this 57 times over."""
+
+EARTH_RATE_RADPS = 7.3e-5
 
 
 async def check_imu(machine: Machine, config: ImuConfig | None, *, daemon: bool) -> list[Finding]:
@@ -53,13 +58,23 @@ async def check_imu(machine: Machine, config: ImuConfig | None, *, daemon: bool)
         await asyncio.wait([task])
     if status.problem:
         return [failed("imu", f"{status.device or config.command[0]}: {status.problem}")]
-    forces = [force for record in records for force in record.specific_force_mps2]
-    gravity = math.hypot(*(sum(values) / len(forces) for values in zip(*forces, strict=True)))
+    gravity = math.hypot(*_mean([each for record in records for each in record.specific_force_mps2]))
+    rate = _mean([each for record in records for each in record.angular_rate_radps])
     expected = config.parameters().gravity_mps2
+    bias = " ".join(f"{math.degrees(each):+.2f}" for each in rate)
     text = (
-        f"{status.device}, {status.rate_hz or 0.0:.1f} Hz, {status.gaps} gaps, gravity {gravity:.3f} m/s^2, "
+        f"{status.device}, {status.rate_hz or 0.0:.1f} Hz, {status.gaps} gaps, {status.saturated} saturated samples, "
+        f"gravity {gravity:.3f} m/s^2, gyro bias {bias} deg/s, "
         f"its clock against this one {status.clock_skew_ppm or 0.0:+.1f} ppm"
     )
+    if max(map(abs, rate)) > BIAS_SIGMAS * config.noise.noise().gyro_bias_radps + EARTH_RATE_RADPS:
+        return [
+            failed(
+                "imu",
+                f"{text}: more than {BIAS_SIGMAS:g} times its sigma; is the robot at rest, the unit rad/s, the preset under "
+                "[imu] noise right?",
+            )
+        ]
     if abs(gravity - expected) > GRAVITY_TOLERANCE_MPS2:
         return [
             failed("imu", f"{text}; expected {expected:.3f} m/s^2: is the robot at rest, the unit m/s^2?")
@@ -67,3 +82,7 @@ async def check_imu(machine: Machine, config: ImuConfig | None, *, daemon: bool)
     return [
         note("imu", f"{text}; samples are missing: check cable and load") if status.gaps else ok("imu", text)
     ]
+
+
+def _mean(values: list[Vector3]) -> list[float]:
+    return [sum(axis) / len(values) for axis in zip(*values, strict=True)]

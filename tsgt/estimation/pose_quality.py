@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.estimation.pose_batch import Degradation, Kind, Reason
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from tsgt.estimation.pose_batch import PoseBatch
     from tsgt.model import PipelineParameters
 
-MIN_PRISMS = 3
 DEGRADED_SHARE = 0.5
 """Share of a limit above which a pose is degraded: a sigma that doubles, as in half a second without measurements, makes it
 invalid.
@@ -72,7 +72,8 @@ def degradations(
     """
     found = np.zeros(len(batch), np.int8)
     seen = np.count_nonzero(batch.prism_reason == Reason.VALID, axis=1)
-    found[seen < MIN_PRISMS] |= Degradation.PRISM_MISSING
+    # A layout of one or two prisms, which needs an IMU, has no more to miss.
+    found[seen < min(MIN_PRISMS, batch.prism_reason.shape[1])] |= Degradation.PRISM_MISSING
     # NaN, for a prism that was never measured, is above no limit: it is missing.
     newest_age_s = np.fmin.reduce(batch.age_s, axis=1)
     old = newest_age_s > OLD_SHARE * limits.outage_limit_ns / 1e9

@@ -16,6 +16,7 @@ import numpy as np
 from tsgt.errors import DegenerateGeometryError, GeometryError
 from tsgt.geometry.alignment import align_many, align_triplets, fit_gain, spread_m
 from tsgt.geometry.rigid import dot, rotate, skew
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -129,8 +130,10 @@ def twists(
     return rotate(rotation, twist[:, :3]), twist[:, 3:]
 
 
-def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> None:
+def check_layout(layout: ArrayLike, names: Sequence[object] | None = None, *, imu: bool = False) -> None:
     """Check that a prism layout, (P, 3) in the robot frame in m, determines poses well; ``names`` are for messages.
+
+    ``imu``: with the robot's IMU one or two prisms suffice, or several in a line.
 
     Raises DegenerateGeometryError: fewer than three prisms, two of them closer than :data:`MIN_PRISM_DISTANCE_M`, or all
     nearly collinear (:data:`MIN_LAYOUT_RATIO`). Raises GeometryError: wrong shape or numbers that are not finite.
@@ -138,9 +141,9 @@ def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> No
     array = np.asarray(layout, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise GeometryError(f"a prism layout has shape (P, 3), got {array.shape}")
-    if len(array) < 3:
+    if len(array) < (1 if imu else MIN_PRISMS):
         raise DegenerateGeometryError(
-            f"a pose needs at least 3 prisms on the robot, the layout has {len(array)}"
+            f"a pose needs at least {MIN_PRISMS} prisms on the robot, or an IMU and one: the layout has {len(array)}"
         )
     if not np.isfinite(array).all():
         raise GeometryError("a prism layout has finite numbers only, got NaN or infinity")
@@ -152,6 +155,8 @@ def check_layout(layout: ArrayLike, names: Sequence[object] | None = None) -> No
                 f"prisms {labels[i]} and {labels[j]} are {distance_m * 1e3:.1f} mm apart, expected at least "
                 f"{MIN_PRISM_DISTANCE_M * 1e3:.0f} mm: correct their positions on the robot"
             )
+    if imu:
+        return
     along_m, across_m, _ = spread_m(array)
     if across_m < MIN_LAYOUT_RATIO * along_m:
         raise DegenerateGeometryError(

@@ -6,6 +6,7 @@ docstrings (``make generated``).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -261,6 +262,30 @@ class ImuStatus(FiniteNumbers):
     fit. Against a counter it also contains the error of the nominal rate."""
     problem: str
     """What is wrong with the device, its program or its values, for people; empty when nothing is."""
+    in_use: bool | None = None
+    """Whether the newest pose rests on it; null where the estimator does not tell."""
+    disagreement: str = ""
+    """Why the estimator does not believe its samples, which disagree with the prisms, for people; empty when it does."""
+    gyro_bias_radps: PositionOrNone = None
+    """Bias of the gyro now, as estimated, in its axes, [x, y, z] in rad/s; null while it is not."""
+    accelerometer_bias_mps2: PositionOrNone = None
+    """Bias of the accelerometer now, as estimated, in its axes, [x, y, z] in m/s^2; null while it is not."""
+
+    def figures(self) -> list[str]:
+        """Return rate, losses and clock, what is wrong, and what the estimator knows, each in words."""
+        parts = [] if self.rate_hz is None else [f"{self.rate_hz:.1f} Hz"]
+        parts += [f"{self.gaps} gaps ({self.lost} samples lost)", f"{self.saturated} saturated"]
+        if self.clock_skew_ppm is not None:
+            parts.append(f"clock {self.clock_skew_ppm:+.1f} ppm")
+        if self.in_use is not None:
+            parts.append("in use" if self.in_use else "not in use")
+        if self.gyro_bias_radps is not None:
+            x, y, z = map(math.degrees, self.gyro_bias_radps)
+            parts.append(f"gyro bias {x:+.3f} {y:+.3f} {z:+.3f} deg/s")
+        if self.accelerometer_bias_mps2 is not None:
+            x, y, z = self.accelerometer_bias_mps2
+            parts.append(f"accelerometer bias {x:+.3f} {y:+.3f} {z:+.3f} m/s^2")
+        return parts + [text for text in (self.problem, self.disagreement) if text]
 
 
 ImuStatusOrNone = ImuStatus | None

@@ -161,12 +161,54 @@ def test_check_rejects_a_degenerate_layout(
     assert outcome.err.count("\n") == 1
 
 
-def test_check_rejects_a_layout_of_two_prisms(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
-    """The error says how many are needed."""
+def test_layout_of_one_prism_needs_an_imu(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
+    """The file alone does not tell whether the robot has one."""
     layout = tmp_path / "layout.toml"
     layout.write_text('kind = "prism_layout"\n[prisms.1]\nposition_m = [1, 0, 0]\n')
     outcome = tsgt("config", "check", layout)
-    assert (outcome.code, "at least 3 prisms" in outcome.err) == (2, True)
+    assert (outcome.code, "needs           an IMU" in outcome.out) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("edit", "problem"),
+    [
+        (("[imu]", "[imu_]"), "imu_: unknown key"),
+        (("[pipeline]", '[pipeline]\nestimator = "linear"'), "2 stations on 2 prisms and an IMU need the"),
+    ],
+)
+def test_check_says_what_two_stations_need(
+    tsgt: Tsgt,  # noqa: F811 (a fixture)
+    examples: Path,
+    edit: tuple[str, str],
+    problem: str,
+) -> None:
+    """Besides the IMU, the estimator that uses it."""
+    master = examples / "master.two-stations.example.toml"
+    outcome = tsgt("config", "check", master)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "imu             imu" in outcome.out
+    master.write_text(master.read_text().replace(*edit))
+    outcome = tsgt("config", "check", master)
+    assert outcome.code == 2
+    assert problem in outcome.err
+
+
+@pytest.mark.parametrize(("stations", "setup"), [(1, "1 station on 1 prism"), (2, "2 stations on 2 prisms")])
+def test_check_rejects_few_stations_without_imu(
+    tsgt: Tsgt,  # noqa: F811 (a fixture)
+    examples: Path,
+    stations: int,
+    setup: str,
+) -> None:
+    """With the file, and what to do."""
+    master = examples / "master.example.toml"
+    master.write_text(master.read_text().partition(f"[[stations]]\nstation = {stations + 1}")[0])
+    outcome = tsgt("config", "check", master)
+    assert outcome.code == 2
+    assert outcome.err == (
+        f"error: {master}: stations: {setup} cannot give poses without an IMU: add the table [imu], or stations until 3 "
+        "prisms are tracked\n"
+    )
 
 
 def test_schema_of_all_kinds(tsgt: Tsgt) -> None:  # noqa: F811 (a fixture)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.records import CLOCK, EVENT, PARAMETERS, POSE, STATUS, measurement
+from harness.records import CLOCK, EVENT, IMU_STATUS, PARAMETERS, POSE, STATUS, measurement
 from scipy.spatial.transform import Rotation
 
 from tsgt.cli.render import render, yaw_pitch_roll_deg
@@ -93,6 +93,17 @@ def test_status_text_omits_unknown_values() -> None:
         "station 1: 4 of 5 usable, last ok 0.20 s ago, received 0.10 s ago, 1.7 Hz, 2 % lost, -90 dBm, SNR 8 dB, "
         "clock bound 0.3 ms; station 2: no measurement yet"
     ) in text
+
+
+def test_status_text_has_the_imu() -> None:
+    """Last, with what is wrong in words."""
+    imu = replace(IMU_STATUS, in_use=False, disagreement="the gyro and the prisms disagree")
+    text = render("status", encode_line(replace(STATUS, imu=imu)))
+    assert text is not None
+    assert text.endswith(
+        "; IMU: 2000 samples, 199.9 Hz, 1 gaps (3 samples lost), 0 saturated, clock -12.5 ppm, not in use, "
+        "the gyro and the prisms disagree, last 0.04 s ago"
+    )
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 2**63 - 1])

@@ -8,7 +8,9 @@ import socket
 import threading
 from typing import TYPE_CHECKING
 
+import click
 import pytest
+from harness.records import IMU_STATUS
 
 from tsgt.cli.status import client_text, duration, master_text, station_label
 from tsgt.model import Status
@@ -98,6 +100,48 @@ def test_master_without_problems() -> None:
     assert well
     for part in ("valid 390", "STATION 2  TRACKING", "1.58 Hz", "loss 2 %", "-81 dBm", "clock bound 0.84 ms"):
         assert part in text
+
+
+def test_sound_imu_is_shown_with_its_biases() -> None:
+    """In narrow lines."""
+    imu = dataclasses.replace(
+        IMU_STATUS,
+        saturated=2,
+        in_use=True,
+        gyro_bias_radps=(0.001, -0.002, 0.0005),
+        accelerometer_bias_mps2=(0.012, -0.034, 0.05),
+    )
+    lines, well = master_text(dataclasses.replace(MASTER, imu=imu))
+    assert well
+    assert lines[-9:] == [
+        "",
+        click.style("IMU  OK", bold=True, reverse=False),
+        "  Acme 7",
+        "  199.9 Hz  last 0.0 s",
+        "  1 gaps, 3 samples lost",
+        "  2 saturated samples",
+        "  clock -12.5 ppm",
+        "  gyro bias +0.06 -0.11 +0.03 deg/s",
+        "  acc. bias +12 -34 +50 mm/s^2",
+    ]
+    assert max(map(len, lines[-7:])) <= WIDTH
+
+
+@pytest.mark.parametrize(
+    ("change", "word", "sound"),
+    [
+        ({"age_s": None}, "NO SAMPLES YET", False),
+        ({"age_s": 3.0}, "SILENT 3.0 s", False),
+        ({"problem": "it repeats the same values"}, "it repeats the same values", False),
+        ({"disagreement": "gyro against prisms"}, "DISAGREES WITH THE PRISMS", False),
+        ({"in_use": False}, "NOT IN USE YET", True),
+    ],
+)
+def test_problem_of_the_imu_is_shown(change: dict[str, object], word: str, *, sound: bool) -> None:
+    """All but the last require action."""
+    lines, well = master_text(dataclasses.replace(MASTER, imu=dataclasses.replace(IMU_STATUS, **change)))  # type: ignore[arg-type]
+    assert word in "\n".join(lines)
+    assert well == sound
 
 
 @pytest.mark.parametrize(

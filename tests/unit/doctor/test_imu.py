@@ -71,6 +71,7 @@ def test_sound_imu(tmp_path: Path) -> None:
     assert rate is not None
     assert float(rate[1]) == pytest.approx(200, abs=5)
     assert "gravity 9.810 m/s^2" in found.detail
+    assert re.search(r"0 saturated samples.*gyro bias \+0\.0\d \+0\.00 \+0\.57 deg/s", found.detail)
 
 
 @pytest.mark.parametrize(
@@ -81,6 +82,14 @@ def test_wrong_gravity(tmp_path: Path, force_mps2: float, expected: str) -> None
     found = findings(tmp_path, specific_force_mps2=[[0.0, 0.0, force_mps2]] * 10)["imu"]
     assert found.outcome is Outcome.FAILED
     assert expected in found.detail
+
+
+def test_turning_robot_or_another_unit(tmp_path: Path) -> None:
+    """A mean rate at rest that is no bias."""
+    rates = [[1e-5 * number, 0.0, 0.15] for number in range(10)]
+    found = findings(tmp_path, angular_rate_radps=rates)["imu"]
+    assert found.outcome is Outcome.FAILED
+    assert "is the robot at rest, the unit rad/s" in found.detail
 
 
 def test_missing_program(tmp_path: Path) -> None:

@@ -40,6 +40,16 @@ def test_two_prisms_are_too_few() -> None:
     assert found(batch) == Degradation.PRISM_MISSING
 
 
+@pytest.mark.parametrize("prisms", [1, 2])
+def test_small_layout_misses_only_its_own_prisms(prisms: int) -> None:
+    """Of one or two prisms, with an IMU."""
+    batch = PoseBatch.blank(np.array([10**18]), tuple(range(1, prisms + 1)), Kind.PREDICTED)
+    batch.age_s[:] = 0.3
+    assert found(batch) == 0
+    batch.prism_reason[0, 0] = Reason.OUTAGE
+    assert found(batch) == Degradation.PRISM_MISSING
+
+
 def test_newest_measurement_counts_for_predictions() -> None:
     """A smoothed pose has measurements on both sides."""
     for kind, expected in ((Kind.PREDICTED, Degradation.OLD_MEASUREMENTS), (Kind.SMOOTHED, 0)):

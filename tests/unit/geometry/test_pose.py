@@ -119,7 +119,7 @@ def test_good_layouts_pass() -> None:
         (LAYOUT[[0, 1, 1]], [4, 7, 9], r"prisms 7 and 9 are 0\.0 mm apart"),
         (np.outer([0, 0.5, 1.2], [1, 1, 0]) + 0.003, None, "prisms 1, 2 and 3 lie nearly in a line"),
         ([[0, 0, 0], [1, 0, 0], [0.5, 0.005, 0]], None, r"they spread 2\.4 mm across it over 408\.2 mm"),
-        (LAYOUT[:2], None, "at least 3 prisms on the robot, the layout has 2"),
+        (LAYOUT[:2], None, "at least 3 prisms on the robot, or an IMU and one: the layout has 2"),
     ],
 )
 def test_degenerate_layout_names_the_prisms(
@@ -128,6 +128,15 @@ def test_degenerate_layout_names_the_prisms(
     """Coincident, collinear and too few prisms are rejected by name, with the measure."""
     with pytest.raises(DegenerateGeometryError, match=message):
         check_layout(layout, names)
+
+
+def test_imu_lets_few_prisms_suffice() -> None:
+    """One, two, or three in a line; but not none, and not two at the same place."""
+    for layout in (LAYOUT[:1], LAYOUT[:2], np.outer([0, 0.5, 1.2], [1, 1, 0])):
+        check_layout(layout, imu=True)
+    for layout, message in ((LAYOUT[:0], "the layout has 0"), (LAYOUT[[0, 0]], "prisms 1 and 2 are 0.0 mm")):
+        with pytest.raises(DegenerateGeometryError, match=message):
+            check_layout(layout, imu=True)
 
 
 @pytest.mark.parametrize(

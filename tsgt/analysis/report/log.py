@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from tsgt.errors import RecordingError
+from tsgt.recording import ImuStatus
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -56,7 +58,7 @@ class Log:
     """Records of a recording other than measurements and poses.
 
     ``radio`` and ``clocks`` are by station, ``events`` are (stamp_ns, message) in the order of the file, ``protocol`` and
-    ``authenticated`` are those of the last status (None without a radio).
+    ``authenticated`` are those of the last status (None without a radio), as is ``imu`` (None without an IMU).
     """
 
     radio: dict[int, RadioSeries]
@@ -64,6 +66,7 @@ class Log:
     events: tuple[tuple[int, str], ...]
     protocol: str | None
     authenticated: bool | None
+    imu: ImuStatus | None = None
 
 
 def read_log(path: Path) -> Log:
@@ -97,6 +100,7 @@ def read_log(path: Path) -> Log:
         events=tuple(events),
         protocol=last.get("protocol"),
         authenticated=last.get("authenticated"),
+        imu=_imu(last.get("imu")),
     )
 
 
@@ -106,6 +110,13 @@ def _parsed(raw: bytes) -> dict[str, Any]:
     except ValueError:
         return {}
     return record if isinstance(record, dict) and isinstance(record.get("stamp_ns"), int) else {}
+
+
+def _imu(status: object) -> ImuStatus | None:
+    try:
+        return None if status is None else TypeAdapter(ImuStatus).validate_python(status)
+    except ValidationError:
+        return None
 
 
 def _radio(statuses: list[dict[str, Any]]) -> dict[int, RadioSeries]:

@@ -76,6 +76,7 @@ def _recording(f: Findings) -> Section:
         ("stations, prisms", f"{len(parameters.stations)}, {len(parameters.prisms)}"),
         ("measurements", f"{sum(e.measurements for e in f.station_statistics.values())}"),
         ("radio protocol", f.log.protocol or UNKNOWN),
+        *([] if f.log.imu is None else [("IMU", ", ".join([f.log.imu.device, *f.log.imu.figures()]))]),
         ("events recorded", f"{len(f.log.events)}"),
     ]
     tables = [Table("", (), tuple(rows))]

@@ -11,6 +11,8 @@ from scipy.special import chdtrc
 from tsgt.errors import DegenerateGeometryError
 from tsgt.geometry.polar import measurement_covariance
 from tsgt.geometry.target_calibration.causes import (
+    MIN_BLUNDER_M,
+    MIN_FURTHER_BLUNDER_M,
     Cause,
     CauseKind,
     SelectionRules,
@@ -32,7 +34,7 @@ from tsgt.geometry.target_calibration.network import (
     linearise,
     solve,
 )
-from tsgt.geometry.target_calibration.prisms import MIN_POINTS, STATION_LIMITS
+from tsgt.geometry.target_calibration.prisms import MIN_POINTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -126,7 +128,7 @@ def calibrate_network(
     rows = range(len(readings.stations))
     known = {(row, c): np.inf for row in rows[1:] for c in components}
     known |= {(row, 6 + c): DATA_SHEET_SIGMA[error] for row in rows for c, error in enumerate(ERRORS)}
-    rules = SelectionRules(STATION_LIMITS.blunder_m, levelled=levelled)
+    rules = SelectionRules(MIN_BLUNDER_M, MIN_FURTHER_BLUNDER_M, levelled=levelled)
     network = start
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_ROUNDS):
@@ -365,7 +367,7 @@ def _suspects(
     """Causes that a selection without limits finds beyond the selected ones, if there is a misfit at all."""
     if overall.p_value > MISFIT_LEVEL:
         return ()
-    rules = SelectionRules(0.0, levelled=levelled)
+    rules = SelectionRules(0.0, 0.0, levelled=levelled)
     base = network.without_errors()
     found = select_causes(readings, linearise(readings, base, known, noise), rules)
     selected = {cause.label for cause in causes}

@@ -137,27 +137,29 @@ class CauseSearch:
             chosen, cost = improved
 
     def alternatives(self, chosen: Subset) -> list[tuple[Subset, Subset]]:
-        """Return which of the chosen causes others may replace that explain nearly as well, whatever their penalties.
+        """Return which of the chosen causes others may replace that explain nearly as well.
 
-        One by one, one by two of a group, and two of a group by one.
+        One by one, whatever their penalties; one by two of a group and two of a group by one, which have other numbers of
+        unknowns, with them.
         """
         others = [cause for cause in range(self._count) if cause not in chosen]
-        by_size: list[list[tuple[Subset, Subset]]] = [
-            [((cause,), (other,)) for cause in chosen for other in others],
-            [((cause,), pair) for cause in chosen for pair in self._pairs if not {*pair} & {*chosen}],
-            [(pair, (other,)) for pair in self._pairs if {*pair} <= {*chosen} for other in others],
+        single = [((cause,), (other,)) for cause in chosen for other in others]
+        more: list[tuple[Subset, Subset]] = [
+            ((cause,), pair) for cause in chosen for pair in self._pairs if not {*pair} & {*chosen}
         ]
-        limit = self._likelihoods([chosen])[0] + AMBIGUITY
-        found = []
-        for exchanges in by_size:
-            likelihoods = self._likelihoods([exchanged(chosen, *each) for each in exchanges])
-            found += [each for each, value in zip(exchanges, likelihoods, strict=True) if value < limit]
+        fewer: list[tuple[Subset, Subset]] = [
+            (pair, (other,)) for pair in self._pairs if {*pair} <= {*chosen} for other in others
+        ]
+        found: list[tuple[Subset, Subset]] = []
+        for exchanges, cost in ((single, self._likelihoods), (more, self.costs), (fewer, self.costs)):
+            if exchanges:
+                limit = cost([chosen])[0] + AMBIGUITY
+                values = cost([exchanged(chosen, *each) for each in exchanges])
+                found += [each for each, value in zip(exchanges, values, strict=True) if value < limit]
         return found
 
     def _likelihoods(self, subsets: Sequence[Subset]) -> FloatArray:
         """Twice the negative logarithm of likelihood and odds of subsets of one size, (s,)."""
-        if not subsets:
-            return np.empty(0)
         index = np.array(subsets, dtype=np.intp)
         likelihoods: FloatArray = self.misfits(index) + self._odds_of(index)
         return likelihoods

@@ -22,7 +22,7 @@ from tsgt.geometry.target_calibration.network import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,11 +50,11 @@ ODDS: dict[CauseKind, float] = {
     CauseKind.INSTRUMENT: 4.0,
     CauseKind.TARGET_CONSTANT: 6.0,
     CauseKind.SIGHT: 10.0,
-    CauseKind.TRIPOD: 14.0,
+    CauseKind.TRIPOD: 18.0,
     CauseKind.TILT: 6.0,
 }
 """Twice the negative logarithm of the odds: one in 7 for an instrument outside its data sheet, one in 150 for a wrong sight, one in
-1100 for a tripod that moves between two given sights. Of several wrong sights of a station only the first counts."""
+8000 for a tripod that moves between two given sights, of which there are some fifty. Of several wrong sights of a station only the first counts."""
 PENALTIES: dict[CauseKind, float] = {
     CauseKind.INSTRUMENT: 8.0,
     CauseKind.TARGET_CONSTANT: 8.0,
@@ -72,6 +72,9 @@ LARGEST_ERROR = {
 }
 """Beyond, something else is wrong: 2 mrad are 7 arcminutes, 300 ppm an atmosphere of 300 degrees, 50 mm more than any two
 reflectors differ."""
+MIN_BLUNDER_M = 0.010
+"""Smallest displacement of a sight that is rejected: a constant wrong by 10 mm moves single targets of the authors' sets by as much."""
+MIN_FURTHER_BLUNDER_M = 0.006  # Of a sight beside a larger one of the same station
 MIN_TARGETS_PER_ROUND = 3  # Before and after a tripod moved, to tell it from wrong sights
 
 
@@ -106,10 +109,12 @@ class Cause:
 class SelectionRules:
     """What may be selected.
 
-    ``blunder_m``: smallest displacement of a sight; ``levelled``: look for tilts.
+    ``blunder_m``: smallest displacement of a sight, ``further_m``: beside a larger one of the same station; ``levelled``: look
+    for tilts.
     """
 
     blunder_m: float
+    further_m: float
     levelled: bool
 
 
@@ -169,7 +174,7 @@ def _selected(readings: TargetReadings, linear: Linearisation, rules: SelectionR
         )
         chosen = search.best()
         values = search.estimates(chosen)
-        implausible = {row for row in chosen if not _is_plausible(causes[row], values[row], rules)}
+        implausible = _implausible({row: causes[row] for row in chosen}, values, rules)
         if not implausible:
             break
         candidates = [each for row, each in enumerate(candidates) if row not in implausible]
@@ -191,8 +196,8 @@ def _selected(readings: TargetReadings, linear: Linearisation, rules: SelectionR
         subset = exchanged(chosen, old, new)
         if not _is_possible([causes[each] for each in subset]):
             return False
-        estimates = search.estimates(subset)
-        return all(_is_plausible(causes[each], estimates[each], rules) for each in new)
+        implausible = _implausible({each: causes[each] for each in subset}, search.estimates(subset), rules)
+        return not implausible & set(new)
 
     possible: dict[int, dict[int, None]] = {row: {} for row in chosen}
     for old, new in alternatives:
@@ -278,13 +283,25 @@ def _tripods(readings: TargetReadings, linear: Linearisation) -> list[tuple[Caus
     return found
 
 
-def _is_plausible(cause: Cause, value: FloatArray, rules: SelectionRules) -> bool:
-    size = float(np.linalg.norm(value[:3]))
-    if cause.kind is CauseKind.SIGHT:
-        return size >= rules.blunder_m
-    if cause.kind is CauseKind.TARGET_CONSTANT:
-        return size <= LARGEST_ERROR[InstrumentError.RANGE_CONSTANT]
-    return cause.error is None or size <= LARGEST_ERROR[cause.error]
+def _implausible(
+    chosen: Mapping[int, Cause], values: Mapping[int, FloatArray], rules: SelectionRules
+) -> set[int]:
+    """Chosen causes whose size makes no sense."""
+    sizes = {row: float(np.linalg.norm(values[row][:3])) for row in chosen}
+    blundered = {
+        cause.station
+        for row, cause in chosen.items()
+        if cause.kind is CauseKind.SIGHT and sizes[row] >= rules.blunder_m
+    }
+
+    def is_plausible(row: int, cause: Cause) -> bool:
+        if cause.kind is CauseKind.SIGHT:
+            return sizes[row] >= (rules.further_m if cause.station in blundered else rules.blunder_m)
+        if cause.kind is CauseKind.TARGET_CONSTANT:
+            return sizes[row] <= LARGEST_ERROR[InstrumentError.RANGE_CONSTANT]
+        return cause.error is None or sizes[row] <= LARGEST_ERROR[cause.error]
+
+    return {row for row, cause in chosen.items() if not is_plausible(row, cause)}
 
 
 def _is_possible(causes: Sequence[Cause]) -> bool:

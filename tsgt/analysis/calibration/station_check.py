@@ -17,7 +17,7 @@ from tsgt.geometry import log_so3
 from tsgt.geometry.target_calibration import (
     FALSE_ALARM_RATE,
     MIN_POINTS,
-    STATION_LIMITS,
+    WEAK_STATION_RAD,
     FrameFit,
     PointPairs,
     fit_frame,
@@ -98,6 +98,6 @@ def _fit(pairs: PointPairs) -> tuple[FrameFit | None, bool]:
             fit = fit_frame(PointPairs(pairs.source, pairs.target, levelled), weighted=True)
         except DegenerateGeometryError:
             continue
-        if np.linalg.eigvalsh(fit.covariance[3:, 3:]).max() <= STATION_LIMITS.weak_rad**2:
+        if np.linalg.eigvalsh(fit.covariance[3:, 3:]).max() <= WEAK_STATION_RAD**2:
             return fit, levelled
     return None, False

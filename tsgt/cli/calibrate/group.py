@@ -27,7 +27,7 @@ from tsgt.cli.calibrate.motion import motion
 from tsgt.cli.calibrate.targets import targets
 from tsgt.cli.options import constant_m, constant_option, json_option
 from tsgt.cli.output import CHECK_FAILED, numbers, print_json, print_table, refuse_overwrite
-from tsgt.geometry.target_calibration import BODY_LIMITS
+from tsgt.geometry.target_calibration import WEAK_BODY_RAD
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -152,6 +152,6 @@ def _warn(frame: FrameCalibration) -> bool:
             err=True,
         )
     for weak in frame.weak:
-        limit_mrad = 1e3 * BODY_LIMITS.weak_rad
+        limit_mrad = 1e3 * WEAK_BODY_RAD
         click.echo(f"check failed: {weak_text('robot frame', 'body point', weak, limit_mrad)}", err=True)
     return not frame.consistent or bool(frame.weak)

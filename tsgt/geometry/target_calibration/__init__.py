@@ -20,18 +20,17 @@ from tsgt.geometry.target_calibration.network import (
     TargetReadings,
 )
 from tsgt.geometry.target_calibration.prisms import (
-    BODY_LIMITS,
     FALSE_ALARM_RATE,
     MIN_POINTS,
-    STATION_LIMITS,
+    WEAK_BODY_RAD,
     FrameCalibration,
     PrismCalibration,
     WeakAxis,
-    calibrate_frame,
     calibrate_prisms,
 )
 from tsgt.geometry.target_calibration.station_frames import (
     CONSISTENCY,
+    WEAK_STATION_RAD,
     Check,
     checks,
     station_frames,
@@ -39,13 +38,13 @@ from tsgt.geometry.target_calibration.station_frames import (
 )
 
 __all__ = [
-    "BODY_LIMITS",
     "CONSISTENCY",
     "DATA_SHEET_SIGMA",
     "ERRORS",
     "FALSE_ALARM_RATE",
     "MIN_POINTS",
-    "STATION_LIMITS",
+    "WEAK_BODY_RAD",
+    "WEAK_STATION_RAD",
     "Cause",
     "CauseKind",
     "Check",
@@ -62,7 +61,6 @@ __all__ = [
     "PrismCalibration",
     "TargetReadings",
     "WeakAxis",
-    "calibrate_frame",
     "calibrate_network",
     "calibrate_prisms",
     "checks",

@@ -1,12 +1,12 @@
-"""Frames from points measured in two of them: stations from targets, prisms from body points. Sans-I/O.
+"""Prisms in the robot frame from body points that are known from CAD. Sans-I/O.
 
-The points are aligned (paper section III-C, "Calibration procedure": Arun et al. 1987), by default weighted by the noise of
-both. Each is predicted from all others: data snooping (Baarda 1968, three coordinates at a time) rejects outliers.
+The points are aligned (paper section III-C, "Calibration procedure": Arun et al. 1987), weighted by the noise of both sets.
+Each is predicted from all others: data snooping (Baarda 1968, three coordinates at a time) rejects outliers.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,26 +38,12 @@ optimistic to test the prediction.
 MIN_POINTS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Limits that depend on what the frame is for."""
+WEAK_BODY_RAD = 5e-3
+"""One-sigma rotation of the robot's body above which an axis is weak: 5 mm at a prism one metre off the axis."""
 
-    weak_rad: float  # One-sigma rotation above which an axis is weak
-    # Smallest prediction error that is rejected as a blunder: a wrong prism constant, common to all points, may cause
-    # less
-    blunder_m: float
-
-
-STATION_LIMITS = Limits(weak_rad=0.5e-3, blunder_m=0.01)
-"""For stations. 0.5 mrad is 10 mm at a prism 20 m off the axis, as much as the rest of the system together. Targets all around
-give 0.06 to 0.11 mrad (the authors' field sets), four of them nearly collinear 3 to 5 mrad. A constant wrong by 10 mm moves
-single targets of these sets by up to 11 mm.
-"""
-
-BODY_LIMITS = Limits(weak_rad=5e-3, blunder_m=0.003)
-"""For the robot's body: 5 mm at a prism one metre off the axis. All points are seen from about one side, so that a wrong constant
-hardly distorts them.
-"""
+MIN_BLUNDER_M = 0.003
+"""Smallest prediction error of a body point that is rejected. All points are seen from about one side, so that a wrong constant
+hardly distorts them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,56 +104,33 @@ class PrismCalibration:
     joint_covariance_m2: FloatArray  # (3 n, 3 n) of all prisms in their order
 
 
-def calibrate_frame(
-    source: PointSet,
-    target: PointSet,
-    *,
-    weighted: bool = True,
-    levelled: bool = False,
-    limits: Limits = STATION_LIMITS,
-) -> FrameCalibration:
-    """Find the frame ``source`` in the frame ``target`` from the points that both have.
+def calibrate_body(body: PointSet, body_cad: PointSet) -> FrameCalibration:
+    """Find the frame ``body`` in the frame ``body_cad`` from the points that both have.
 
-    Raises DegenerateGeometryError: fewer than three common points, or they coincide or are collinear (levelled: above one
-    another).
-    Raises GeometryError: a covariance of the source is singular.
-
-    Parameters
-    ----------
-    source, target : Paired by name; unpaired points are ignored. No covariance of the source may be singular.
-    weighted
-        Weight each residual with its inverse covariance (maximum likelihood); False is Arun's unweighted least squares.
-        Outlier tests follow the noise model either way.
-    levelled : Both z axes are vertical: only heading and position are solved.
+    Raises DegenerateGeometryError: fewer than three common points, or they coincide or are collinear. Raises GeometryError:
+    a covariance of ``body`` is singular.
     """
-    common = [name for name in target.names if name in source.names]
+    common = [name for name in body_cad.names if name in body.names]
     if len(common) < MIN_POINTS:
         listed = ", ".join(map(str, common)) or "none"
         raise DegenerateGeometryError(
             f"expected at least {MIN_POINTS} points known in both frames, got {len(common)} ({listed}); "
             "measure more of them"
         )
-    pairs = PointPairs(source.select(common), target.select(common), levelled)
+    pairs = PointPairs(body.select(common), body_cad.select(common), levelled=False)
     if np.linalg.eigvalsh(pairs.source.covariances_m2).min() <= 0:
         raise GeometryError(
             "expected noise in every direction of every source point, got a singular covariance"
         )
     fit_frame(pairs, weighted=True)  # raises for a degenerate set
-    outliers = _outliers(pairs, limits.blunder_m)
-    return frame_without(
-        pairs, outliers or (), weighted=weighted, limits=limits, consistent=outliers is not None
-    )
+    outliers = _outliers(pairs)
+    frame = frame_without(pairs, outliers or (), weighted=True)
+    weak = weak_axes(frame.covariance, pairs.without(*(outliers or ())).target.points_m, WEAK_BODY_RAD)
+    return replace(frame, consistent=outliers is not None, weak=weak)
 
 
-def frame_without(
-    pairs: PointPairs,
-    outliers: Sequence[PointName],
-    *,
-    weighted: bool,
-    limits: Limits,
-    consistent: bool = True,
-) -> FrameCalibration:
-    """Fit a frame to all but the outliers, whatever the residuals are."""
+def frame_without(pairs: PointPairs, outliers: Sequence[PointName], *, weighted: bool) -> FrameCalibration:
+    """Fit a frame to all but the outliers, whatever the residuals are; the caller judges it."""
     kept = pairs.without(*outliers)
     fit = fit_frame(kept, weighted=weighted)
     predictions = [_Prediction.of(kept, name, weighted=weighted) for name in kept.names]
@@ -180,9 +143,9 @@ def frame_without(
         rejected=tuple(
             RejectedPoint(name, float(np.linalg.norm(fit.residuals_m(pairs.only(name))))) for name in outliers
         ),
-        consistent=consistent,
-        weak=weak_axes(fit.covariance, kept.target.points_m, limits.weak_rad),
-        tilt_rad=_tilt_rad(kept) if pairs.levelled else None,
+        consistent=True,
+        weak=(),
+        tilt_rad=None,
     )
 
 
@@ -192,7 +155,7 @@ def calibrate_prisms(body: PointSet, body_cad: PointSet, prisms: PointSet) -> Pr
     ``body_cad`` has the body points in the robot frame, from CAD, with the build tolerance as covariance. Raises
     DegenerateGeometryError: fewer than three body points, or they coincide or are collinear.
     """
-    frame = calibrate_frame(body, body_cad, limits=BODY_LIMITS)
+    frame = calibrate_body(body, body_cad)
     rotation = frame.T[:3, :3]
     jacobian = pose_jacobian(prisms.points_m @ rotation.T)
     covariances = (
@@ -247,20 +210,15 @@ class _Prediction:
     def normalised_squared_error(self) -> float:
         """Squared error over its covariance."""
         squared = float(self.error_m @ np.linalg.solve(self.covariance_m2, self.error_m))
-        return squared / _noise_scale(self.variance_ratio)
+        return squared / min(max(self.variance_ratio, 1.0), MAX_NOISE_SCALE**2)
 
 
-def _noise_scale(variance_ratio: float) -> float:
-    """Factor on the noise model's variances from the variance ratio of the residuals: 1 to ``MAX_NOISE_SCALE`` squared."""
-    return min(max(variance_ratio, 1.0), MAX_NOISE_SCALE**2)
-
-
-def _worst_outlier(pairs: PointPairs, blunder_m: float) -> PointName | None:
+def _worst_outlier(pairs: PointPairs) -> PointName | None:
     """Name the point with the largest significant prediction error (chi squared, Bonferroni)."""
     scores = {}
     for name in pairs.names:
         prediction = _Prediction.of(pairs, name, weighted=True)
-        if prediction is not None and prediction.length_m >= blunder_m:
+        if prediction is not None and prediction.length_m >= MIN_BLUNDER_M:
             scores[name] = prediction.normalised_squared_error
     worst = max(scores, key=lambda name: scores[name], default=None)
     if worst is None or scores[worst] <= chdtri(3, FALSE_ALARM_RATE / len(pairs.names)):
@@ -268,15 +226,15 @@ def _worst_outlier(pairs: PointPairs, blunder_m: float) -> PointName | None:
     return worst
 
 
-def _outliers(pairs: PointPairs, blunder_m: float) -> tuple[PointName, ...] | None:
+def _outliers(pairs: PointPairs) -> tuple[PointName, ...] | None:
     """Outliers, found one at a time; None if ambiguous, near half of all, under four remain, or the rest is inconsistent."""
     outliers: list[PointName] = []
     kept = pairs
     max_outliers = (len(pairs.names) - MIN_POINTS) // 2
-    while (suspect := _worst_outlier(kept, blunder_m)) is not None:
+    while (suspect := _worst_outlier(kept)) is not None:
         others = [name for name in kept.names if name != suspect]
         if len(outliers) == max_outliers or any(
-            _worst_outlier(kept.without(name), blunder_m) is None for name in others
+            _worst_outlier(kept.without(name)) is None for name in others
         ):
             return None
         outliers.append(suspect)
@@ -298,17 +256,3 @@ def weak_axes(covariance: FloatArray, points_m: FloatArray, limit_rad: float) ->
             x, y, z = (axis if axis @ points_m.mean(axis=0) >= 0 else -axis).tolist()
             weak.append(WeakAxis((x, y, z), float(np.sqrt(variance))))
     return tuple(weak)
-
-
-def _tilt_rad(pairs: PointPairs) -> float | None:
-    """Angle between the z axes if it is significant: the chi-squared test of the two additional unknowns."""
-    free = PointPairs(pairs.source, pairs.target, levelled=False)
-    try:
-        tilted = fit_frame(free, weighted=True)
-    except DegenerateGeometryError:
-        return None  # collinear points
-    tilted_chi_squared = tilted.chi_squared(free)
-    drop = fit_frame(pairs, weighted=True).chi_squared(pairs) - tilted_chi_squared
-    if drop <= chdtri(2, FALSE_ALARM_RATE) * _noise_scale(tilted_chi_squared / free.redundancy):
-        return None
-    return float(np.arccos(np.clip(tilted.rotation[2, 2], -1.0, 1.0)))

@@ -44,14 +44,15 @@ class ContinuousEstimator:
     """The estimator ``continuous``, with the interface of :class:`~tsgt.estimation.linear.LinearEstimator`.
 
     ``outside_lag_window``: by station, how many measurements arrived after the poses of their time had been smoothed.
-    Raises DegenerateGeometryError if the prisms of the layout are fewer than three, coincident or collinear.
+    Raises DegenerateGeometryError if prisms of the layout coincide or, without an IMU, are fewer than three or collinear.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self._limits = parameters.pipeline
         self._columns = {prism.prism: column for column, prism in enumerate(parameters.prisms)}
-        check_layout([prism.position_m for prism in parameters.prisms], names=tuple(self._columns))
+        layout = [prism.position_m for prism in parameters.prisms]
+        check_layout(layout, names=tuple(self._columns), imu=parameters.imu is not None)
         self._stations = {station.station: station for station in parameters.stations}
         self._noise_scales = noise_scales(parameters)
         self._poses = ContinuousPoseOutput(parameters)

@@ -18,7 +18,7 @@ import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.config import ClassicMasterConfig
-from tsgt.errors import RadioError, StreamError
+from tsgt.errors import DegenerateGeometryError, RadioError, StreamError
 from tsgt.estimation import LiveEstimator
 from tsgt.imu import Imu
 from tsgt.master.classic import ClassicLink
@@ -119,14 +119,14 @@ async def run_master(
         try:
             async with server, asyncio.TaskGroup() as group:
                 stations = [station.station for station in config.stations]
-                layout: Observer = LayoutMonitor(config.frame_watch, parameters.pipeline.period_ns)
-                if parameters.pipeline.estimator != "linear":
-                    layout = _LinearPoses(layout, parameters)
                 publisher = Publisher(
                     parameters,
                     Statistics(stations),
                     StationEventDetector(stations, start_ns),
-                    [layout, *(_GeofenceObserver(geofence, group) for geofence in config.geofences)],
+                    [
+                        _layout_monitor(config, parameters),
+                        *(_GeofenceObserver(geofence, group) for geofence in config.geofences),
+                    ],
                     emit,
                     lambda: timeline.unix_ns(clock.monotonic_ns()),
                 )
@@ -286,6 +286,27 @@ class _Master:
                 raise
 
         return opened
+
+
+def _layout_monitor(config: MasterConfig, parameters: Parameters) -> Observer:
+    monitor = LayoutMonitor(config.frame_watch, parameters.pipeline.period_ns)
+    if parameters.pipeline.estimator == "linear":
+        return monitor
+    try:
+        return _LinearPoses(monitor, parameters)
+    except DegenerateGeometryError:  # one or two prisms, or all in a line, and an IMU
+        return _FinalPoses(monitor)
+
+
+class _FinalPoses(Observer):
+    """Gives an observer the final poses only. Unlike without an IMU, their trajectory does not give way to wrong prisms."""
+
+    def __init__(self, observer: Observer) -> None:
+        self._observer = observer
+
+    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
+        final = record.kind == "smoothed" and record.delay_s is None
+        return self._observer.pose(record, now_ns) if final else []
 
 
 class _LinearPoses(Observer):

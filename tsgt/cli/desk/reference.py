@@ -83,7 +83,7 @@ def compare_estimators(
     centroid_m = centroid_at_point(loaded.parameters)
     try:
         linear = process(with_estimator(loaded, "linear"), path=path)
-    except RecordingError:
+    except (RecordingError, DegenerateGeometryError):
         # No valid pose, which is a result as well.
         linear = PoseBatch.blank(np.empty(0, np.int64), continuous.poses.prisms)
     both: tuple[tuple[Estimator, PoseBatch], ...] = (("linear", linear), ("continuous", continuous.poses))

@@ -35,7 +35,7 @@ from tsgt.errors import OutputFileError, TsgtError
 from tsgt.estimation import point_label, reference_point_text
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.log import configure_logging
-from tsgt.model import ReferencePoint
+from tsgt.model import MIN_PRISMS, ReferencePoint
 from tsgt.recording import write_atomically
 from tsgt.simulation.checks import Violation, check_invariants
 from tsgt.simulation.faults import (
@@ -219,6 +219,11 @@ def simulate_command(
         faults=faults,
         **given,
     )
+    if scenario.imu.model == "none" and len({station.prism for station in scenario.stations}) < MIN_PRISMS:
+        click.echo(
+            f"note: poses need {MIN_PRISMS} tracked prisms, or an IMU: add --imu industrial or --imu consumer",
+            err=True,
+        )
     _check_times(options)
     configure_logging("critical" if faults else "error")  # the figures say what happened
     replay_command = _replay_command(click.get_current_context())

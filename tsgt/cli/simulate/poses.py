@@ -22,7 +22,7 @@ from tsgt.analysis.evaluation import (
     interior_mask,
 )
 from tsgt.analysis.processing import Estimator, process, with_estimator
-from tsgt.errors import RecordingError
+from tsgt.errors import DegenerateGeometryError, RecordingError
 from tsgt.estimation import PoseBatch, build_tracks, centroid_at_point, sigma_limits_of
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.recording import Recording, RecordingHeader
@@ -87,8 +87,8 @@ def _measurements(run: MissionResult) -> list[Measurement]:
 def _processed_figures(run: MissionResult, recording: Recording) -> EstimatorFigures:
     try:
         poses = process(recording, path=Path("the run's recording"))
-    except RecordingError:
-        # No valid pose, for example with fewer stations than prisms.
+    except (RecordingError, DegenerateGeometryError):
+        # No valid pose, for example with fewer than three stations and without an IMU.
         poses = PoseBatch.blank(np.empty(0, np.int64), ())
     valid = poses.valid
     return _pose_figures(
@@ -158,7 +158,7 @@ def _pose_figures(
 def _inter_prism_mean_mm(run: MissionResult) -> float:
     """Return the mean absolute error of the interpolated distances over all pairs."""
     tracks = build_tracks(run.parameters, _measurements(run))
-    if not all(len(track) for track in tracks.values()):
+    if len(tracks) < 2 or not all(len(track) for track in tracks.values()):
         return math.nan
     pairs = inter_prism(run.parameters, tracks).dynamic
     return float(np.mean([pair.statistics().mean_abs_error for pair in pairs]))

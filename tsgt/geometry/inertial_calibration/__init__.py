@@ -12,12 +12,14 @@ from tsgt.geometry.inertial_calibration.observability import (
     setup_components,
 )
 from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_main_axes
-from tsgt.geometry.inertial_calibration.setup_check import SetupFinding, check_imu_setup
+from tsgt.geometry.inertial_calibration.setup_check import Cause, SetupCheck, SetupFinding, check_imu_setup
 
 __all__ = [
     "Alignment",
+    "Cause",
     "ImuCalibration",
     "ImuSetup",
+    "SetupCheck",
     "SetupComponent",
     "SetupFinding",
     "SetupPrior",

@@ -1,7 +1,8 @@
 """Check of a configured IMU against the motion that stations measure: wrong mounting, latency, axes, units. Sans-I/O.
 
 Gross errors, which no estimate survives, show in the rates and forces themselves. For the others the set-up is estimated as in a
-calibration, and compared with the configured one: a cause is named if it is significant and large enough to harm.
+calibration, and compared with the configured one: a cause is named if it is significant and large enough to harm, and ruled out if
+the estimate is certain enough and near.
 """
 
 from __future__ import annotations
@@ -41,12 +42,18 @@ Cause = Literal[
 ]
 """``unrelated``: rates that are not the robot's at all."""
 
+GROSS: frozenset[Cause] = frozenset({"unit_of_rate", "unit_of_force", "gravity_sign", "axes", "unrelated"})
+"""Causes that rates and forces themselves show."""
+
 MIN_ROTATION_RAD = math.radians(0.5)
 MIN_POSITION_M = 0.05
 MIN_LATENCY_S = 0.004
 """Errors below these harm little: a few tenths of a millimetre, a few hundredths of a degree."""
 
 MIN_SIGNIFICANCE = 5.0  # Sigmas, of three components together
+EXCLUDED_LIMITS, EXCLUDED_SIGMAS = 2.0, 3.0
+"""An error is ruled out if it is below this many of the limits above, with this many sigmas added."""
+
 MIN_MEASUREMENTS = 60
 MATRIX_SIGMA = 3e-3  # Of the matrices beside what is configured
 MIN_RATE_FACTOR, MIN_FORCE_FACTOR = 2.0, 1.25
@@ -72,6 +79,14 @@ class SetupFinding:
     text: str
 
 
+@dataclass(frozen=True, slots=True)
+class SetupCheck:
+    """What a drive says about the configuration of an IMU; nothing, if it does not tell."""
+
+    findings: tuple[SetupFinding, ...] = ()
+    excluded: frozenset[Cause] = frozenset()  # Causes that it rules out
+
+
 def check_imu_setup(
     observations: Observations,
     states: States,
@@ -79,8 +94,8 @@ def check_imu_setup(
     mounting: Mounting,
     noise: ImuNoise,
     gravity: Gravity,
-) -> list[SetupFinding]:
-    """Compare a configured IMU with a drive of up to a minute; no finding where the drive does not tell.
+) -> SetupCheck:
+    """Compare a configured IMU with a drive of up to a minute.
 
     Takes a tenth of a second or two of computing.
 
@@ -94,20 +109,21 @@ def check_imu_setup(
     """
     robot, imu = series_of_states(states, gravity), series_of_samples(samples)
     if not turns(robot):
-        return []
+        return SetupCheck()
     units = _wrong_units(robot, imu, gravity)
     if units:
-        return units
+        return SetupCheck(tuple(units))
     try:
         alignment = align(robot, imu)
     except GeometryError:
         text = "the angular rates of the IMU are not those of the robot at any latency: it is another robot's"
-        return [SetupFinding("unrelated", 0.0, 0.0, text)]
+        return SetupCheck((SetupFinding("unrelated", 0.0, 0.0, text),))
     products = products_at(robot, imu, alignment.latency_s)
     gross = _wrong_axes(products, alignment.rotation, mounting.rotation)
     if gross is not None:
-        return [gross]
-    return _estimated_errors(observations, states, samples, mounting, noise, gravity, alignment)
+        return SetupCheck((gross,))
+    found = _estimated_errors(observations, states, samples, mounting, noise, gravity, alignment)
+    return replace(found, excluded=found.excluded | GROSS)
 
 
 def _wrong_units(robot: Series, imu: Series, gravity: Gravity) -> list[SetupFinding]:
@@ -167,7 +183,7 @@ def _estimated_errors(
     noise: ImuNoise,
     gravity: Gravity,
     alignment: Alignment,
-) -> list[SetupFinding]:
+) -> SetupCheck:
     """Find errors of mounting and latency by joint estimation."""
     filled = contiguous(samples, noise)
     count = int(observations.station.max()) + 1
@@ -178,7 +194,7 @@ def _estimated_errors(
     stamps_s = stamp_times(observations, start)
     measured = observations.select((stamps_s > filled.bounds_s[0]) & (stamps_s < filled.bounds_s[-1]))
     if len(measured) < MIN_MEASUREMENTS:
-        return []
+        return SetupCheck()
     try:
         solution = solve_jointly(
             measured,
@@ -190,25 +206,30 @@ def _estimated_errors(
             start=start,
         )
     except GeometryError:
-        return []
+        return SetupCheck()
     error = solution.point.setup.local_coordinates_about(configured)
     covariance = solution.factor.shared_covariance[TILT_DIM:, TILT_DIM:]
-    findings = []
-    for cause, rows, limit in (
+    parts: tuple[tuple[Cause, slice, float], ...] = (
         ("rotation", ROTATION, MIN_ROTATION_RAD),
         ("position", POSITION, MIN_POSITION_M),
         ("latency", slice(LATENCY, LATENCY + 1), MIN_LATENCY_S),
-    ):
+    )
+    findings: list[SetupFinding] = []
+    excluded: set[Cause] = set()
+    for cause, rows, limit in parts:
         part, own = error[rows], covariance[rows, rows]
         size = float(np.linalg.norm(part))
+        if size + EXCLUDED_SIGMAS * np.sqrt(np.linalg.eigvalsh(own)[-1]) < EXCLUDED_LIMITS * limit:
+            excluded.add(cause)
         if size < limit or part @ np.linalg.solve(own, part) < MIN_SIGNIFICANCE**2:
             continue
         sigma = float(np.sqrt(part @ own @ part)) / size
-        findings.append(SetupFinding(cause, size, sigma, _describe(cause, part, sigma, mounting)))  # type: ignore[arg-type]
-    return findings
+        findings.append(SetupFinding(cause, size, sigma, _describe(cause, part, sigma, mounting)))
+        excluded.discard(cause)
+    return SetupCheck(tuple(findings), frozenset(excluded))
 
 
-def _describe(cause: str, error: FloatArray, sigma: float, mounting: Mounting) -> str:
+def _describe(cause: Cause, error: FloatArray, sigma: float, mounting: Mounting) -> str:
     if cause == "rotation":
         x, y, z = np.degrees(mounting.rotation @ error)
         size_deg, sigma_deg = np.degrees(np.linalg.norm(error)), np.degrees(sigma)

@@ -12,7 +12,7 @@ from harness.imu_calibration import uncalibrated_drive
 
 from tsgt.geometry import exp_so3
 from tsgt.geometry.batch import fit_trajectory
-from tsgt.geometry.inertial_calibration import SetupFinding, check_imu_setup
+from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding, check_imu_setup
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
@@ -34,7 +34,7 @@ class Configured:
     noise: ImuNoise
     gravity: Gravity
 
-    def check(self) -> list[SetupFinding]:
+    def check(self) -> SetupCheck:
         """Check it."""
         return check_imu_setup(
             self.observations, self.states, self.samples, self.mounting, self.noise, self.gravity
@@ -66,9 +66,9 @@ def drive(grade: str = "industrial", seed: int = 0) -> Configured:
     )
 
 
-def only(findings: list[SetupFinding]) -> SetupFinding:
+def only(check: SetupCheck) -> SetupFinding:
     """Return the only finding."""
-    (finding,) = findings
+    (finding,) = check.findings
     return finding
 
 
@@ -147,13 +147,15 @@ def test_robot_at_rest_tells_nothing() -> None:
     """Without turning there is no finding, whatever is wrong."""
     right = drive().sampled(np.eye(3) / DEG)
     still = replace(right.states, angular_velocity=np.zeros_like(right.states.angular_velocity))
-    assert replace(right, states=still).check() == []
+    assert replace(right, states=still).check() == SetupCheck()
 
 
 @pytest.mark.parametrize("grade", ["industrial", pytest.param("consumer", marks=pytest.mark.slow)])
 def test_right_setup_is_not_reported(grade: str) -> None:
-    """No false alarm."""
-    assert drive(grade).check() == []
+    """No false alarm; what harms is ruled out."""
+    check = drive(grade).check()
+    assert check.findings == ()
+    assert check.excluded >= {"axes", "rotation", "latency"}
 
 
 @pytest.mark.slow
@@ -161,4 +163,4 @@ def test_right_setup_is_not_reported(grade: str) -> None:
 def test_no_false_alarm_on_clean_drives(grade: str) -> None:
     """Twenty drives of each class."""
     for seed in range(20):
-        assert drive(grade, 100 + seed).check() == [], seed
+        assert drive(grade, 100 + seed).check().findings == (), seed

@@ -1,0 +1,154 @@
+"""Checks the configuration of the robot's IMU while the robot drives, from the start. Sans-I/O.
+
+Every 20 s the last 50 s of measurements and samples are compared (`geometry.inertial_calibration.check_imu_setup`). What a
+check finds stands until a later one rules it out. A check takes a quarter of a second of computing: it may run beside, and its
+result counts a fixed time after its start, so that a replay gives the same.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+from tsgt.estimation.inertial import inertial_samples
+from tsgt.estimation.noise_scales import noise_scales
+from tsgt.estimation.observations import build_observations, centroid_m
+from tsgt.geometry import rotation_from_quaternion
+from tsgt.geometry.batch import fit_trajectory, scale_noise
+from tsgt.geometry.inertial import Gravity, Mounting
+from tsgt.geometry.inertial_calibration import SetupCheck, check_imu_setup
+from tsgt.recording import EventRecord
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from tsgt.geometry.inertial_calibration import Cause, SetupFinding
+    from tsgt.model import ImuSamples, Measurement, Parameters
+
+    StartCheck = Callable[[Callable[[], SetupCheck]], Callable[[], SetupCheck]]
+    """Starts a computation, and returns what waits for its result."""
+
+WINDOW_NS = 50_000_000_000
+FIRST_NS = 30_000_000_000  # Of measurements before the first check
+INTERVAL_NS = 20_000_000_000
+RESULT_NS = 4_000_000_000  # From the start of a check to its result; a slow computer takes a second or two
+
+CONFIRMED: frozenset[Cause] = frozenset({"axes", "rotation", "latency"})
+"""What must be ruled out until the set-up counts as checked. On flat ground the position is not determined."""
+
+_REMEDIES: dict[Cause, str] = {
+    "unit_of_rate": "let its program give rad/s",
+    "unit_of_force": "let its program give m/s^2",
+    "gravity_sign": "let its program give the specific force, which points up at rest",
+    "axes": "correct orientation_xyzw or the axes that its program gives",
+    "rotation": "calibrate it: tsgt calibrate imu",
+    "position": "calibrate it: tsgt calibrate imu",
+    "latency": "calibrate it: tsgt calibrate imu; or check the clock of the computer that stamps the samples",
+    "unrelated": "check which device the program reads, and its clock",
+}
+
+
+def start_now(work: Callable[[], SetupCheck]) -> Callable[[], SetupCheck]:
+    """Compute at once."""
+    result = work()
+    return lambda: result
+
+
+def check_recorded_setup(
+    parameters: Parameters, measurements: Iterable[Measurement], records: Iterable[ImuSamples]
+) -> SetupCheck:
+    """Compare the configured IMU with measurements and samples of up to a minute."""
+    imu = parameters.imu
+    measurements = list(measurements)
+    if imu is None or not measurements:
+        return SetupCheck()
+    origin_ns = measurements[0].stamp_ns
+    observations, _ = build_observations(parameters, measurements, origin_ns=origin_ns)
+    samples = inertial_samples(records, imu, origin_ns)
+    rotation = rotation_from_quaternion(np.array(imu.orientation_xyzw))
+    mounting = Mounting(rotation, np.array(imu.position_m) - centroid_m(parameters))
+    observations = scale_noise(observations, noise_scales(parameters))
+    try:
+        fit = fit_trajectory(observations, prior=parameters.pipeline.motion, noise_scale=1.0, rest=())
+        return check_imu_setup(
+            fit.observations, fit.trajectory.knots, samples, mounting, imu.noise, Gravity.of(imu)
+        )
+    except GeometryError:  # Too few measurements or samples: there is nothing to compare
+        return SetupCheck()
+
+
+class ImuSetupMonitor:
+    """Monitors the set-up of an IMU that is configured; ``start``: how a check is computed."""
+
+    def __init__(self, parameters: Parameters, start: StartCheck = start_now) -> None:
+        self._parameters = parameters
+        self._start = start
+        self._measurements: deque[Measurement] = deque()
+        self._records: deque[ImuSamples] = deque()
+        self._next_ns: int | None = None
+        self._result: Callable[[], SetupCheck] | None = None
+        self._result_ns = 0
+        self._standing: dict[Cause, SetupFinding] = {}
+        self._confirmed = False
+        self._events: list[EventRecord] = []
+
+    @property
+    def untrusted(self) -> str | None:
+        """Why the IMU must not be used: what is wrong in its set-up; None if nothing is known to be."""
+        return "; ".join(each.text for each in self._standing.values()) or None
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether a drive has shown that the set-up is right, and none since that it is wrong."""
+        return self._confirmed
+
+    def take_events(self) -> Sequence[EventRecord]:
+        """Return the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def measurement(self, measurement: Measurement) -> None:
+        """Take a measurement at its ``received_ns``."""
+        now_ns = measurement.received_ns
+        self._measurements.append(measurement)
+        while self._measurements[0].received_ns < now_ns - WINDOW_NS:
+            self._measurements.popleft()
+        if self._next_ns is None:
+            self._next_ns = now_ns + FIRST_NS
+        if self._result is not None and now_ns >= self._result_ns:
+            self._judge(self._result(), now_ns)
+            self._result = None
+        if self._result is None and now_ns >= self._next_ns:
+            self._begin(now_ns)
+
+    def samples(self, record: ImuSamples) -> None:
+        """Take samples of the IMU at their ``received_ns``."""
+        self._records.append(record)
+        while self._records[0].received_ns < record.received_ns - WINDOW_NS:
+            self._records.popleft()
+
+    def _begin(self, now_ns: int) -> None:
+        self._next_ns = now_ns + INTERVAL_NS
+        if not self._records:
+            return
+        parameters, measurements, records = self._parameters, tuple(self._measurements), tuple(self._records)
+        self._result = self._start(lambda: check_recorded_setup(parameters, measurements, records))
+        self._result_ns = now_ns + RESULT_NS
+
+    def _judge(self, check: SetupCheck, now_ns: int) -> None:
+        for cause in check.excluded & self._standing.keys():
+            del self._standing[cause]
+        for finding in check.findings:
+            if finding.cause not in self._standing:
+                message = f"{finding.text}; {_REMEDIES[finding.cause]}"
+                self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_wrong", message=message))
+            self._standing[finding.cause] = finding
+        if self._standing:
+            self._confirmed = False
+        elif not self._confirmed and check.excluded >= CONFIRMED:
+            self._confirmed = True
+            message = "the mounting and the latency of the IMU agree with the drive"
+            self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_confirmed", message=message))

@@ -22,7 +22,8 @@ from scipy.spatial.transform import Rotation
 from tsgt.analysis.calibration import calibrate_recorded_imu
 from tsgt.config import SimulatedImu, SuperframeMasterConfig
 from tsgt.geometry import log_so3, rotation_from_quaternion
-from tsgt.geometry.inertial_calibration import in_main_axes
+from tsgt.geometry.inertial import Mounting
+from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
 from tsgt.log import configure_logging
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.options import SimulationOptions
@@ -70,13 +71,21 @@ def mission(name: str, model: str, seed: int, duration_s: float) -> tuple[FloatA
         found = calibrate_recorded_imu(load_recording(path), read_imu_samples(path))
         cpu_s = time.process_time() - started_s
     truth = run.imu.truth
-    gyro_matrix = np.asarray(np.linalg.inv(truth.gyro_matrix), np.float64)
     calibration = found.calibration
-    rotation, _ = in_main_axes(truth.mounting.R_robot_imu, gyro_matrix, calibration.setup.main_axis)
+    exact = in_main_axes(
+        ImuSetup(
+            Mounting(truth.mounting.R_robot_imu, truth.mounting.position_m),
+            truth.latency_s,
+            np.asarray(np.linalg.inv(truth.gyro_matrix), np.float64),
+            np.asarray(np.linalg.inv(truth.accelerometer_matrix), np.float64),
+            np.zeros(3),
+            calibration.setup.main_axis,
+        )
+    )
     estimate = rotation_from_quaternion(np.array(found.parameters.orientation_xyzw))
     error = np.concatenate(
         [
-            np.degrees(log_so3(estimate @ rotation.T)),
+            np.degrees(log_so3(estimate @ exact.mounting.rotation.T)),
             1e3 * (np.array(found.parameters.position_m) - truth.mounting.position_m),
             [found.parameters.latency_ns / 1e6 - 1e3 * truth.latency_s],
         ]

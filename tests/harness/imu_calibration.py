@@ -69,15 +69,17 @@ def uncalibrated_drive(
         specific_force_mps2=exact.specific_force_mps2 @ accelerometer.T,
     )
     centroid = drive.layout.mean(axis=0)
-    mounted = rotation_from_quaternion(np.array(imu.orientation_xyzw))
-    rotation, gyro_matrix = in_main_axes(mounted, np.asarray(np.linalg.inv(gyro), np.float64), 2)
-    truth = ImuSetup(
-        Mounting(rotation, np.array(imu.position_m) - centroid),
-        latency_s,
-        gyro_matrix,
-        rotation.T @ mounted @ np.linalg.inv(accelerometer),
-        np.zeros(3),
-        2,
+    truth = in_main_axes(
+        ImuSetup(
+            Mounting(
+                rotation_from_quaternion(np.array(imu.orientation_xyzw)), np.array(imu.position_m) - centroid
+            ),
+            latency_s,
+            np.asarray(np.linalg.inv(gyro), np.float64),
+            np.asarray(np.linalg.inv(accelerometer), np.float64),
+            np.zeros(3),
+            2,
+        )
     )
     observations = replace(drive.measure(seed=seed), layout=drive.layout - centroid)
     return UncalibratedDrive(observations, samples, imu, truth, centroid)

@@ -28,6 +28,7 @@ from tsgt.geometry.inertial_calibration.setup import (
     LATENCY,
     POSITION,
     ROTATION,
+    accelerometer_directions,
     gyro_directions,
 )
 from tsgt.geometry.rigid import FloatArray, exp_so3, fast_log_so3, inverse_right_jacobian, matvec, skew
@@ -206,7 +207,12 @@ def motion_by_matrices(
     by_gyro = np.einsum(
         "kril,jl,sij->krs", by_rate, np.linalg.inv(setup.gyro_matrix), gyro_directions(setup.main_axis)
     )
-    by_accelerometer = (by_force @ np.linalg.inv(setup.accelerometer_matrix).T).reshape(len(found), 9, 9)
+    by_accelerometer = np.einsum(
+        "kril,jl,sij->krs",
+        by_force,
+        np.linalg.inv(setup.accelerometer_matrix),
+        accelerometer_directions(setup.main_axis),
+    )
     by_error = np.concatenate([by_gyro, by_accelerometer], axis=2)
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
     _, rotation, _ = found.corrected(earlier.gyro_bias, earlier.bias_or_acceleration)

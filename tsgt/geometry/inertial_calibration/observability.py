@@ -15,6 +15,7 @@ from tsgt.geometry.inertial_calibration.setup import (
     POSITION,
     ROTATION,
     gyro_directions,
+    other_axes,
 )
 
 if TYPE_CHECKING:
@@ -79,11 +80,11 @@ def setup_components(calibration: ImuCalibration) -> list[SetupComponent]:
 
 
 def _matrix_names(main_axis: int) -> list[str]:
-    i, j = (axis for axis in range(3) if axis != main_axis)
-    pairs = [(i, j), (main_axis, i), (main_axis, j)]
+    i, j = other_axes(main_axis)
+    pairs = [(i, j), (j, i), (main_axis, i), (main_axis, j)]
     return [
         *(f"scale of the gyro's {axis}" for axis in "xyz"),
-        *(f"misalignment of the gyro's {'xyz'[a]} and {'xyz'[b]}" for a, b in pairs),
+        *(f"cross-axis sensitivity of the gyro's {'xyz'[a]} to {'xyz'[b]}" for a, b in pairs),
     ]
 
 
@@ -94,6 +95,6 @@ def robot_covariance(calibration: ImuCalibration) -> FloatArray:
     jacobian[0:3, POSITION] = np.eye(3)
     jacobian[3:6, ROTATION] = setup.mounting.rotation
     jacobian[6, LATENCY] = 1.0
-    jacobian[7:16, GYRO_MATRIX] = gyro_directions(setup.main_axis).reshape(6, 9).T
+    jacobian[7:16, GYRO_MATRIX] = gyro_directions(setup.main_axis).reshape(7, 9).T
     covariance = jacobian @ calibration.covariance @ jacobian.T
     return np.asarray(0.5 * (covariance + covariance.T))

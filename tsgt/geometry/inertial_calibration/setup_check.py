@@ -27,7 +27,7 @@ from tsgt.geometry.inertial_calibration.alignment import (
 )
 from tsgt.geometry.inertial_calibration.joint_solver import solve_jointly, states_of_imu
 from tsgt.geometry.inertial_calibration.joint_system import stamp_times
-from tsgt.geometry.inertial_calibration.setup import LATENCY, POSITION, ROTATION, ImuSetup, SetupPrior
+from tsgt.geometry.inertial_calibration.setup import LATENCY, POSITION, ImuSetup, SetupPrior, gyro_rotation
 from tsgt.geometry.rigid import log_so3
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ EXCLUDED_LIMITS, EXCLUDED_SIGMAS = 2.0, 3.0
 """An error is ruled out if it is below this many of the limits above, with this many sigmas added."""
 
 MIN_MEASUREMENTS = 60
-MATRIX_SIGMA = 3e-3  # Of the matrices beside what is configured
+MATRIX_SIGMA = 1e-2  # Of the matrices beside what is configured
 MIN_RATE_FACTOR, MIN_FORCE_FACTOR = 2.0, 1.25
 MAX_AXES_ERROR_RAD = math.radians(15.0)
 MIN_GAIN = 25.0  # Half the decrease of the sum of squares by which other axes explain rates and forces better
@@ -209,15 +209,17 @@ def _estimated_errors(
         return SetupCheck()
     error = solution.point.setup.local_coordinates_about(configured)
     covariance = solution.factor.shared_covariance[TILT_DIM:, TILT_DIM:]
-    parts: tuple[tuple[Cause, slice, float], ...] = (
-        ("rotation", ROTATION, MIN_ROTATION_RAD),
-        ("position", POSITION, MIN_POSITION_M),
-        ("latency", slice(LATENCY, LATENCY + 1), MIN_LATENCY_S),
+    # The axes that are configured are the gyro's: the accelerometer's may be turned against them in the case.
+    identity = np.eye(len(error))
+    parts: tuple[tuple[Cause, FloatArray, float], ...] = (
+        ("rotation", gyro_rotation(solution.point.setup), MIN_ROTATION_RAD),
+        ("position", identity[POSITION], MIN_POSITION_M),
+        ("latency", identity[LATENCY : LATENCY + 1], MIN_LATENCY_S),
     )
     findings: list[SetupFinding] = []
     excluded: set[Cause] = set()
-    for cause, rows, limit in parts:
-        part, own = error[rows], covariance[rows, rows]
+    for cause, jacobian, limit in parts:
+        part, own = jacobian @ error, jacobian @ covariance @ jacobian.T
         size = float(np.linalg.norm(part))
         if size + EXCLUDED_SIGMAS * np.sqrt(np.linalg.eigvalsh(own)[-1]) < EXCLUDED_LIMITS * limit:
             excluded.add(cause)

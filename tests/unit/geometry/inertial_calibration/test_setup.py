@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tsgt.geometry import exp_so3
 from tsgt.geometry.inertial import Mounting
 from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
-from tsgt.geometry.inertial_calibration.setup import gyro_directions
+from tsgt.geometry.inertial_calibration.setup import accelerometer_directions, gyro_directions, gyro_rotation
 
 
 def test_retraction_and_local_coordinates_are_inverse() -> None:
@@ -20,16 +22,39 @@ def test_retraction_and_local_coordinates_are_inverse() -> None:
 
 
 @pytest.mark.parametrize("main_axis", [0, 1, 2])
-def test_main_axes_keep_the_rates_of_the_robot(main_axis: int) -> None:
-    """Mounting times matrix stays the same, the rotation stays one, and the matrix keeps its free components alone."""
+def test_main_axes_keep_the_motion_of_the_robot(main_axis: int) -> None:
+    """Mounting times matrix stays the same, the rotation stays one, and the matrices keep their free components alone."""
     rng = np.random.default_rng(1)
-    rotation, matrix = exp_so3(rng.normal(size=3)), np.eye(3) + rng.normal(scale=0.02, size=(3, 3))
-    turned, found = in_main_axes(rotation, matrix, main_axis)
-    np.testing.assert_allclose(turned @ found, rotation @ matrix, atol=1e-12)
-    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(turned) > 0
-    directions = gyro_directions(main_axis)
-    free = directions.reshape(6, 9)
-    remaining = (found - np.eye(3)).ravel()
-    remaining = remaining - free.T @ np.linalg.solve(free @ free.T, free @ remaining)
-    assert np.abs(remaining).max() < 1e-7
+    matrices = [np.eye(3) + rng.normal(scale=0.02, size=(3, 3)) for _ in range(2)]
+    setup = replace(
+        ImuSetup.initial(Mounting(exp_so3(rng.normal(size=3)), np.zeros(3)), 0.0, 3),
+        gyro_matrix=matrices[0],
+        accelerometer_matrix=matrices[1],
+        main_axis=main_axis,
+    )
+    found = in_main_axes(setup)
+    before, after = setup.mounting.rotation, found.mounting.rotation
+    np.testing.assert_allclose(after @ after.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(after) > 0
+    for was, becomes, directions in (
+        (setup.gyro_matrix, found.gyro_matrix, gyro_directions(main_axis)),
+        (setup.accelerometer_matrix, found.accelerometer_matrix, accelerometer_directions(main_axis)),
+    ):
+        np.testing.assert_allclose(after @ becomes, before @ was, atol=1e-12)
+        free = directions.reshape(-1, 9)
+        remaining = (becomes - np.eye(3)).ravel()
+        remaining = remaining - free.T @ np.linalg.solve(free @ free.T, free @ remaining)
+        assert np.abs(remaining).max() < 1e-7
+
+
+@pytest.mark.parametrize("main_axis", [0, 1, 2])
+def test_rotation_of_the_gyro(main_axis: int) -> None:
+    """Turning the gyro alone, or mounting and both sensors, turns its axes alike."""
+    setup = ImuSetup.initial(Mounting(np.eye(3), np.zeros(3)), 0.0, 3)
+    setup = replace(setup, main_axis=main_axis)
+    turn = 0.01 * np.eye(3)[main_axis]
+    alone = replace(setup, gyro_matrix=exp_so3(turn))
+    mounted = replace(setup, mounting=Mounting(exp_so3(turn), np.zeros(3)))
+    for turned in (alone, mounted):
+        error = turned.local_coordinates_about(setup)
+        np.testing.assert_allclose(gyro_rotation(setup) @ error, turn, atol=1e-6)

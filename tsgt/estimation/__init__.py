@@ -6,7 +6,7 @@ In: raw measurements and the parameters in force. Out: poses with covariance, va
 `reference_point` carries them to another point of the robot.
 """
 
-from tsgt.estimation.inertial import inertial_samples
+from tsgt.estimation.inertial import SampleConverter, inertial_samples
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
@@ -53,6 +53,7 @@ __all__ = [
     "MeasurementHistory",
     "PoseBatch",
     "Reason",
+    "SampleConverter",
     "Track",
     "build_observations",
     "build_tracks",

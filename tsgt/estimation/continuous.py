@@ -3,7 +3,8 @@
 Each epoch (the whole multiples of a period in Unix time) gets a pose *predicted* from all measurements that were added
 before, and a lag later one *smoothed* by the measurements on both sides. Smoothed poses are computed in groups, with the
 first prediction of each half second, which is cheaper. At each of the configured delays below the lag there is one more,
-smoothed by the measurements that have arrived by the first epoch at which the delay has passed. The poses depend only on the order of the calls, not on when the
+smoothed by the measurements that have arrived by the first epoch at which the delay has passed. With an IMU the predictions
+integrate its samples from the newest measurement on; :mod:`~tsgt.estimation.imu_takeover` says when it is used. The poses depend only on the order of the calls, not on when the
 estimator is asked: a replay gives the same poses bit for bit.
 """
 
@@ -16,22 +17,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.estimation.imu_takeover import ImuTakeover
 from tsgt.estimation.noise_scales import noise_scales
-from tsgt.estimation.observations import build_observations
+from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Kind, PoseBatch
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.setup_uncertainty import setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
+from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tsgt.estimation.imu_takeover import TrajectoryWindow
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import States
-    from tsgt.model import Measurement, Parameters
+    from tsgt.model import ImuSamples, Measurement, Parameters
 
 SMOOTHING_INTERVAL_NS = 500_000_000
 
@@ -56,7 +60,12 @@ class ContinuousEstimator:
         self._stations = {station.station: station for station in parameters.stations}
         self._noise_scales = noise_scales(parameters)
         self._poses = ContinuousPoseOutput(parameters)
-        self._window = FixedLagSmoother(self._limits.motion, setup_jacobian(parameters))
+        self._without_imu = FixedLagSmoother(self._limits.motion, setup_jacobian(parameters))
+        self._imu = (
+            None
+            if parameters.imu is None
+            else ImuTakeover(parameters.imu, self._without_imu, self._create_with_imu)
+        )
         self._pending: list[Measurement] = []
         none = np.empty(0, np.int64)
         self._unusable: list[list[int]] = [[] for _ in self._columns]
@@ -72,10 +81,22 @@ class ContinuousEstimator:
         self.outside_lag_window: Counter[int] = Counter()
         self._none = PoseBatch.blank(none, tuple(self._columns), Kind.PREDICTED)
 
+    @property
+    def _window(self) -> TrajectoryWindow:
+        return self._without_imu if self._imu is None else self._imu.window
+
+    def _create_with_imu(self) -> InertialFixedLagSmoother:
+        assert self._parameters.imu is not None  # noqa: S101 (only called with one)
+        return InertialFixedLagSmoother(
+            self._parameters.imu, self._limits.motion, reference_m=centroid_m(self._parameters)
+        )
+
     def begin_at(self, now_ns: int) -> None:
         """Start with the first epoch after an instant."""
         if self._next_epoch_ns is None:
             self._origin_ns = now_ns
+            if self._imu is not None:
+                self._imu.begin(now_ns)
             self._next_epoch_ns = (now_ns // self._limits.period_ns + 1) * self._limits.period_ns
             self._next_smoothed_ns = self._first_epoch_ns = self._next_epoch_ns
 
@@ -91,18 +112,25 @@ class ContinuousEstimator:
             bisect.insort(self._unusable[column], measured_at_ns(measurement, station))
             self._update_unusable()
 
+    def add_samples(self, samples: ImuSamples) -> None:
+        """Add samples of the IMU; ignored where none is configured."""
+        if self._imu is not None:
+            self._imu.add_samples(samples)
+
     def advance(self, now_ns: int) -> PoseBatch:
         """Return the predicted poses of new epochs up to now, and the poses that are smoothed with them."""
         batches: list[PoseBatch] = []
         while self._next_epoch_ns is not None and self._next_epoch_ns <= now_ns:
             epoch_ns, period_ns = self._next_epoch_ns, self._limits.period_ns
-            self._take_pending()
+            jump_from = self._take_pending(epoch_ns)
             if epoch_ns // SMOOTHING_INTERVAL_NS != (epoch_ns - period_ns) // SMOOTHING_INTERVAL_NS:
                 batches.append(self._smoothed_until(epoch_ns - self._limits.lag_ns))
             # Epochs up to the next smoothing use the same measurements.
             next_smoothing_ns = (epoch_ns // SMOOTHING_INTERVAL_NS + 1) * SMOOTHING_INTERVAL_NS
             due_ns = range(epoch_ns, min(now_ns + 1, next_smoothing_ns), period_ns)
-            batches.append(self._with_delayed(self._predicted(due_ns)))
+            if self._imu is not None:
+                due_ns = due_ns[:1]  # the IMU may have fallen silent since
+            batches.append(self._with_delayed(self._predicted(due_ns, jump_from)))
             self._next_epoch_ns = due_ns[-1] + period_ns
         return PoseBatch.concatenated(batches or [self._none])
 
@@ -110,13 +138,32 @@ class ContinuousEstimator:
         """Return when the next pose is due; None before the first measurement."""
         return self._next_epoch_ns
 
-    def _take_pending(self) -> None:
+    def _take_pending(self, epoch_ns: int) -> States | None:
+        """Use the measurements that were added; with an IMU return what was predicted for an epoch, if that has changed."""
+        if self._imu is None:
+            self._use_pending()
+            return None
+        epoch_s = (epoch_ns - self._origin_ns) / 1e9
+        self._imu.take_samples()
+        before, window = None, self._window
+        if self._pending and window.converged:
+            before = window.predict(epoch_s, dim=_POSE_DIM)[0]
+        self._use_pending()
+        self._imu.choose(epoch_s)
+        if self._window is not window:
+            self._record(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.intp))
+            if before is None and window.converged:
+                before = window.predict(epoch_s, dim=_POSE_DIM)[0]
+        return before if self._window.converged else None
+
+    def _use_pending(self) -> None:
         if not self._pending:
             return
         observations, sources = build_observations(self._parameters, self._pending, origin_ns=self._origin_ns)
         self._pending.clear()
         # A station may deliver a backlog of hours.
-        late = observations.time_s < max(self._window.horizon_s, -self._limits.lag_ns / 1e9)
+        target = self._imu or self._without_imu
+        late = observations.time_s < max(target.horizon_s, -self._limits.lag_ns / 1e9)
         self.outside_lag_window.update(
             source.station for source, is_late in zip(sources, late, strict=True) if is_late
         )
@@ -129,7 +176,7 @@ class ContinuousEstimator:
             return
         if not taken.all():
             observations = observations.select(taken)
-        self._window.update(scale_noise(observations, self._noise_scales))
+        target.update(scale_noise(observations, self._noise_scales))
         self._record(times_ns[taken], stations[taken], observations.prism)
 
     def _record(
@@ -142,11 +189,9 @@ class ContinuousEstimator:
         places = {station: place for place, station in enumerate(self._stations)}
         rows = np.array([places[station] for station in stations.tolist()])
         order = np.lexsort((rows, prisms, times_ns))
-        # What the window has marginalised precedes the rest, which has the same order.
-        before = len(order) - len(self._window.residuals_m)
-        residuals_m = np.concatenate(
-            [history.residuals_m[:before], np.linalg.norm(self._window.residuals_m, axis=1)]
-        )
+        # What the window has marginalised, or not taken yet, precedes the rest, which has the same order.
+        found_m = np.linalg.norm(self._window.residuals_m, axis=1)
+        residuals_m = np.concatenate([history.residuals_m[: len(order) - len(found_m)], found_m])
         self._history = MeasurementHistory(
             times_ns[order],
             stations[order],
@@ -155,9 +200,9 @@ class ContinuousEstimator:
             history.unusable_ns,
         )
 
-    def _predicted(self, epochs_ns: range) -> PoseBatch:
+    def _predicted(self, epochs_ns: range, jump_from: States | None) -> PoseBatch:
         if not self._window.initialised:
-            return self._poses.predicted(epochs_ns, self._history, None, _NONE)
+            return self._with_imu_use(self._poses.predicted(epochs_ns, self._history, None, _NONE))
         time_s = (np.array(epochs_ns, dtype=np.int64) - self._origin_ns) / 1e9
         converged = np.full(len(time_s), self._window.converged and not self._window.ambiguous)
         ambiguous = self._window.recently_ambiguous_at(time_s)
@@ -168,7 +213,7 @@ class ContinuousEstimator:
         if len(found) > 1:
             states = concatenate_states([state for state, _ in found])
             covariance = np.concatenate([each for _, each in found])
-        return self._poses.predicted(
+        batch = self._poses.predicted(
             epochs_ns,
             self._history,
             states,
@@ -177,6 +222,15 @@ class ContinuousEstimator:
             converged=converged,
             ambiguous=ambiguous,
         )
+        if jump_from is not None:
+            batch.jump[0] = self._poses.distance(jump_from, states.select(slice(1)))
+        return self._with_imu_use(batch)
+
+    def _with_imu_use(self, batch: PoseBatch) -> PoseBatch:
+        """Fill in whether poses rest on the IMU."""
+        if self._imu is not None:
+            batch.imu[:] = self._imu.use
+        return batch
 
     def _with_delayed(self, predicted: PoseBatch) -> PoseBatch:
         """Return predicted poses, each after the smoothed ones whose delay has passed with its epoch."""
@@ -216,15 +270,17 @@ class ContinuousEstimator:
             common = trajectory.common_at(time_s, dim=_POSE_DIM)
         reliable = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)
         reliable &= ~self._window.ambiguous_at(time_s)
-        return self._poses.smoothed(
-            stamp_ns,
-            self._history,
-            states,
-            covariance,
-            common=common,
-            converged=reliable & self._window.converged,
-            ambiguous=self._window.recently_ambiguous_at(time_s),
-            now_ns=sent_ns,
+        return self._with_imu_use(
+            self._poses.smoothed(
+                stamp_ns,
+                self._history,
+                states,
+                covariance,
+                common=common,
+                converged=reliable & self._window.converged,
+                ambiguous=self._window.recently_ambiguous_at(time_s),
+                now_ns=sent_ns,
+            )
         )
 
     def _update_unusable(self) -> None:
@@ -232,10 +288,11 @@ class ContinuousEstimator:
         self._history = replace(self._history, unusable_ns=unusable_ns)
 
     def _discard_old(self) -> None:
-        self._window.marginalise_before((self._next_smoothed_ns - self._origin_ns) / 1e9)
+        (self._imu or self._without_imu).marginalise_before((self._next_smoothed_ns - self._origin_ns) / 1e9)
         history = self._history
         kept = history.times_ns >= self._next_smoothed_ns - self._limits.outage_limit_ns
-        kept[len(kept) - len(self._window.residuals_m) :] = True
+        held = len(self._window.residuals_m) if self._imu is None else self._imu.held
+        kept[len(kept) - held :] = True
         for column, unusable_ns in enumerate(self._unusable):
             kept[np.flatnonzero(history.prisms == column)[-1:]] = True  # the last one is needed for its age
             del unusable_ns[: max(0, bisect.bisect_right(unusable_ns, self._next_smoothed_ns) - 1)]

@@ -1,4 +1,4 @@
-"""Live estimation: measurements in; measurements and poses out, in the order of stream and recording. Sans-I/O.
+"""Live estimation: measurements and samples of the IMU in; these and poses out, in the order of stream and recording. Sans-I/O.
 
 The output depends only on the order of the calls and their instants, which are recorded. So a replay, which makes the same
 calls, gives the same lines bit for bit.
@@ -15,7 +15,7 @@ from tsgt.estimation.linear import LinearEstimator
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from tsgt.model import Measurement, Parameters
+    from tsgt.model import ImuSamples, Measurement, Parameters
     from tsgt.recording import PoseRecord
 
 
@@ -24,6 +24,7 @@ class LiveEstimator:
 
     def __init__(self, parameters: Parameters) -> None:
         continuous = parameters.pipeline.estimator == "continuous"
+        self._with_imu = continuous and parameters.imu is not None
         self._estimator = ContinuousEstimator(parameters) if continuous else LinearEstimator(parameters)
         self._now_ns = -(2**63)
         self._begun = False
@@ -42,6 +43,17 @@ class LiveEstimator:
         due = self.advance(measurement.received_ns)
         self._estimator.add(measurement)
         return [*due, measurement, *self.advance(measurement.received_ns)]
+
+    def imu_samples(self, samples: ImuSamples) -> list[ImuSamples | PoseRecord]:
+        """Take samples of the IMU at their ``received_ns``, as :meth:`measurement`; return them after the poses due before."""
+        if not self._with_imu:
+            return [samples]
+        if samples.received_ns < self._now_ns:
+            samples = dataclasses.replace(samples, received_ns=self._now_ns)
+        due = self.advance(samples.received_ns)
+        if isinstance(self._estimator, ContinuousEstimator):
+            self._estimator.add_samples(samples)
+        return [*due, samples]
 
     def advance(self, now_ns: int) -> list[PoseRecord]:
         """Return the poses that are due by now; call it before another record is published."""

@@ -52,6 +52,21 @@ def degradation_words(value: int) -> tuple[stream_records.Degradation, ...]:
     )
 
 
+class ImuUse(IntEnum):
+    """Whether a pose rests on the robot's IMU, and why not."""
+
+    NOT_CONFIGURED = 0
+    USED = 1
+    STARTING = 2
+    SILENT = 3
+    DISAGREES = 4
+
+    @property
+    def word(self) -> stream_records.ImuUse | None:
+        """The word on the stream; None where no IMU is configured."""
+        return cast("stream_records.ImuUse", self.name.lower()) if self else None
+
+
 class Kind(IntEnum):
     """How a pose was computed."""
 
@@ -92,6 +107,10 @@ class PoseBatch:
     age_s: NDArray[np.float64]  # (N, P) age of that measurement at the epoch; NaN where there was none
     prism_residual_m: NDArray[np.float64]  # (N, P) distance of each prism from the fitted layout
     prism_reason: NDArray[np.int8]  # (N, P) values of :class:`Reason` per prism
+    imu: NDArray[np.int8]  # (N,) values of :class:`ImuUse`
+    jump: NDArray[
+        np.float64
+    ]  # (N, 2) in m and rad, by which new measurements moved a prediction; NaN: none did
     prisms: tuple[int, ...]  # numbers of the prisms, the order of the columns
     reference_point: ReferencePoint = ROBOT_ORIGIN  # the frame on the robot whose poses these are
 
@@ -118,6 +137,8 @@ class PoseBatch:
             age_s=np.full((n, p), np.nan),
             prism_residual_m=np.full((n, p), np.nan),
             prism_reason=np.zeros((n, p), np.int8),
+            imu=np.zeros(n, np.int8),
+            jump=np.full((n, 2), np.nan),
             prisms=prisms,
         )
 
@@ -161,6 +182,7 @@ class PoseBatch:
         computed = np.isfinite(self.position_m[:, 0])
         reasons, kinds = [reason.word for reason in Reason], [kind.word for kind in Kind]
         degradations = [degradation_words(value) for value in range(2 * max(Degradation))]
+        uses = [use.word for use in ImuUse]
         # One conversion to Python numbers per array, not per element.
         rows = zip(
             self.stamp_ns.tolist(),
@@ -176,10 +198,12 @@ class PoseBatch:
             self.velocity_mps.tolist(),
             self.angular_velocity_radps.tolist(),
             self.residual_m.tolist(),
+            self.imu.tolist(),
+            self.jump.tolist(),
             self._shares(),
             strict=True,
         )
-        for stamp, kind, delay, reason, degraded, known, *arrays, residual, shares in rows:
+        for stamp, kind, delay, reason, degraded, known, *arrays, residual, imu, jump, shares in rows:
             position, orientation, covariance, common, velocity, angular_velocity = (
                 tuple(array) if known else None for array in arrays
             )
@@ -198,6 +222,9 @@ class PoseBatch:
                 estimator=Kind(kind).estimator,
                 kind=kinds[kind],
                 delay_s=delay / 1e9 if delay else None,
+                imu=uses[imu],
+                jump_m=None if math.isnan(jump[0]) else jump[0],
+                jump_rad=None if math.isnan(jump[0]) else jump[1],
                 valid=reason == Reason.VALID,
                 reason=reasons[reason],
                 quality="invalid" if reason else "degraded" if degraded else "good",

@@ -14,7 +14,7 @@ from tsgt.estimation.observations import centroid_m
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
 from tsgt.estimation.pose_quality import degradations, sigma_limits, worst_sigma
 from tsgt.estimation.reference_point import poses_at
-from tsgt.geometry import quaternion_from_rotation
+from tsgt.geometry import log_so3, quaternion_from_rotation
 from tsgt.geometry.trajectory import ros_covariance, state_at_point, with_second_order_terms
 
 if TYPE_CHECKING:
@@ -78,6 +78,7 @@ class ContinuousPoseOutput:
         ]
         self._to_origin_m = -centroid_m(parameters)
         self._reference_point = parameters.reference_point
+        self._undetermined = Reason.DEGENERATE_GEOMETRY if parameters.imu is None else Reason.UNCERTAIN
 
     def predicted(
         self,
@@ -150,6 +151,13 @@ class ContinuousPoseOutput:
             batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous, known=known
         )
 
+    def distance(self, before: States, after: States) -> tuple[float, float]:
+        """Return the distance of two states' reference points in m, and the rotation between them in rad."""
+        lever_arm = self._to_origin_m + np.array(self._reference_point.position_m)
+        moved = after.position + after.rotation @ lever_arm - before.position - before.rotation @ lever_arm
+        turned = log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
+        return float(np.linalg.norm(moved)), float(np.linalg.norm(turned))
+
     def _latest(
         self, prism: PrismHistory, home_station: int, epoch_ns: int
     ) -> tuple[int, float, float, Reason]:
@@ -220,7 +228,7 @@ class ContinuousPoseOutput:
         """Fill in the poses that are ``known`` (default: all), and the reasons of invalid ones."""
         missing = batch.prism_reason.max(axis=1)
         if states is None:
-            batch.reason[:] = np.where(missing, missing, Reason.DEGENERATE_GEOMETRY)
+            batch.reason[:] = np.where(missing, missing, self._undetermined)
             return poses_at(batch, self._reference_point)
         limits, rotation = self._limits, states.rotation
         if common is not None:

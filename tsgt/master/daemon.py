@@ -23,6 +23,7 @@ from tsgt.estimation import LiveEstimator
 from tsgt.imu import Imu
 from tsgt.master.classic import ClassicLink
 from tsgt.master.geofence import Geofence, run_geofence_command
+from tsgt.master.imu_monitor import ImuUseMonitor
 from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.master.link_events import MasterEvent
 from tsgt.master.publisher import Observer, Publisher
@@ -125,6 +126,7 @@ async def run_master(
                     StationEventDetector(stations, start_ns),
                     [
                         _layout_monitor(config, parameters),
+                        ImuUseMonitor(),
                         *(_GeofenceObserver(geofence, group) for geofence in config.geofences),
                     ],
                     emit,

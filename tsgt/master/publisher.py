@@ -121,8 +121,8 @@ class Publisher:
         self._send(self._estimator.measurement(measurement), measurement.received_ns)
 
     def imu_samples(self, samples: ImuSamples) -> None:
-        """Record samples of the IMU, in the order of arrival among all other lines."""
-        self._emit(samples, encode_line(samples))
+        """Record samples of the IMU, in the order of arrival among all other lines, after the poses due before them."""
+        self._send(self._estimator.imu_samples(samples), samples.received_ns)
 
     def put(self, record: StatusRecord | EventRecord | ClockRecord | BeaconRecord) -> None:
         """Publish a record after the poses that are due by its stamp."""

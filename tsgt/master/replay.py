@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import LiveEstimator
-from tsgt.model import Measurement, Parameters, PointMeasurement, PolarMeasurement
+from tsgt.model import ImuSamples, Measurement, Parameters, PointMeasurement, PolarMeasurement
 from tsgt.recording import (
     BeaconRecord,
     ClockRecord,
@@ -28,10 +28,13 @@ if TYPE_CHECKING:
     from tsgt.master.stream_server import StreamServer
     from tsgt.recording import Line
 
-# Records that arrived at the master; headers and parameters are not on the stream.
-_ARRIVALS: dict[str, type[Measurement | StatusRecord | EventRecord | ClockRecord | BeaconRecord]] = {
+_Arrival = Measurement | ImuSamples | StatusRecord | EventRecord | ClockRecord | BeaconRecord
+
+# Records that arrived at the master; headers and parameters are not on the stream, nor are the samples of an IMU.
+_ARRIVALS: dict[str, type[_Arrival]] = {
     "measurement": PolarMeasurement,
     "point": PointMeasurement,
+    "imu": ImuSamples,
     "clock": ClockRecord,
     "beacon": BeaconRecord,
     "status": StatusRecord,
@@ -53,7 +56,7 @@ def replayed(
     """
     estimator: LiveEstimator | None = None
     missing_poses = 0
-    for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
+    for line in read_lines(path, imu=True, keep_going=keep_going, on_problem=on_problem):
         try:
             if line.type == "parameters":
                 estimator, missing_poses = LiveEstimator(decode_line(Parameters, line, path)), 0
@@ -93,13 +96,17 @@ def greeting(path: Path, *, keep_going: bool = False) -> HelloRecord:
 
 def _arrival(
     estimator: LiveEstimator,
-    record: Measurement | StatusRecord | EventRecord | ClockRecord | BeaconRecord,
+    record: _Arrival,
     line: Line,
 ) -> tuple[int, list[bytes], int]:
     """Pass on an arrival; return its instant, the lines that follow from it, and the number of poses among them."""
     if isinstance(record, StatusRecord | EventRecord | ClockRecord | BeaconRecord):
         now_ns = record.stamp_ns
         records: list[object] = [*estimator.advance(now_ns), record]
+    elif isinstance(record, ImuSamples):
+        now_ns = record.received_ns
+        poses = [encode_line(each) for each in estimator.imu_samples(record)[:-1]]
+        return now_ns, poses, len(poses)
     else:
         now_ns = record.received_ns
         records = [*estimator.measurement(record)]

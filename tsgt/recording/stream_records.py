@@ -33,6 +33,7 @@ Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]
 Quality = Literal["good", "degraded", "invalid"]
 Degradation = Literal["prism_missing", "old_measurements", "uncertain", "ambiguous", "residual"]
+ImuUse = Literal["used", "starting", "silent", "disagrees"]
 
 CONTINUOUS_PROMISE = (
     "The sigmas that the pose states, of position at the reference point and of rotation, each in its least certain "
@@ -46,6 +47,7 @@ LINEAR_PROMISE = (
 PositionOrNone = Vector3 | None
 QuaternionOrNone = Row4 | None
 CovarianceOrNone = Annotated[tuple[float, ...], Field(min_length=36, max_length=36)] | None
+ImuUseOrNone = ImuUse | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,7 +132,7 @@ class StationShare(FiniteNumbers):
 class PoseRecord(FiniteNumbers):
     """The pose of the robot at one epoch, or why there is none."""
 
-    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"delay_s"})
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"delay_s", "imu", "jump_m", "jump_rad"})
 
     type: Literal["pose"] = "pose"
     stamp_ns: int
@@ -163,6 +165,16 @@ class PoseRecord(FiniteNumbers):
     """Of a smoothed pose at one of the configured ``smoothed_delays_s``: that delay, in s, after which it was computed
     from the measurements that had arrived. The key is missing in all other poses. Without a measurement from after its
     epoch it has no numbers, because it would be a prediction."""
+    imu: ImuUseOrNone = None
+    """Whether the pose rests on the robot's IMU: ``used``; ``starting``: not yet, or not again, since its trajectory is not
+    certain enough; ``silent``: no sample for 0.3 s; ``disagrees``: with the measurements of the prisms. Poses without it
+    are those of an estimator without IMU. The key is missing where no IMU is configured."""
+    jump_m: float | None = None
+    """Of a predicted pose with an IMU configured that is the first after measurements were added, or after the use of the
+    IMU changed: distance in m from the position that would have been predicted before. The key is missing in all other
+    poses."""
+    jump_rad: float | None = None
+    """The same for the rotation, in rad."""
     valid: bool
     """Whether the pose may be used. Invalid poses are sent too, with their reason."""
     reason: Reason

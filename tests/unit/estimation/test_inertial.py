@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from harness.records import IMU_PARAMETERS, START, imu_samples
 
-from tsgt.estimation import inertial_samples
+from tsgt.estimation import SampleConverter, inertial_samples
+from tsgt.geometry.inertial import InertialSamples, concatenate_samples
 
 
 def test_values_and_times() -> None:
@@ -49,3 +50,17 @@ def test_no_records_are_no_samples() -> None:
     samples = inertial_samples([], IMU_PARAMETERS, START)
     assert len(samples) == 0
     assert samples.angular_rate_radps.shape == (0, 3)
+
+
+def test_records_one_by_one_are_the_samples_of_all() -> None:
+    """Bit for bit, over joints, a gap and an overlap."""
+    parameters = replace(IMU_PARAMETERS, gyro_matrix=((1.01, 0.02, 0.5), (0.03, 0.98, 0.01), (0.1, 0.0, 1.1)))
+    shifted = imu_samples(10)
+    shifted = replace(shifted, stamp_ns=tuple(stamp + 40_000 for stamp in shifted.stamp_ns))
+    records = [imu_samples(0), shifted, imu_samples(25, 3), imu_samples(26), imu_samples(40)]
+    whole = inertial_samples(records, parameters, START)
+    converter = SampleConverter(parameters, START)
+    parts = concatenate_samples([converter.convert([record]) for record in records])
+    assert 0 < len(whole) < sum(len(record.stamp_ns) for record in records)
+    for each in fields(InertialSamples):
+        np.testing.assert_array_equal(getattr(parts, each.name), getattr(whole, each.name))

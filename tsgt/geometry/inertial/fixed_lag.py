@@ -21,7 +21,6 @@ from tsgt.geometry.inertial.factors import (
     InertialFactors,
     assemble_inertial,
 )
-from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
@@ -47,7 +46,6 @@ from tsgt.geometry.trajectory.gauss_newton import (
     add_measurements,
     nearest_knots,
 )
-from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
     MAX_STEPS,
@@ -75,10 +73,6 @@ SEARCH_GROWTH = (
 )
 MIN_SEARCH_STEP_S = 0.5
 MIN_PATH_M = 0.3  # Of a single prism: without motion it does not tell the heading
-CONSISTENT_ALONE = 5
-"""Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
-each of them. A chance agreement of wrong ones within the gate, five times, is none.
-"""
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
 SAMPLES_MARGIN_S = 0.5  # Before the oldest knot: the sample before a knot tells where the next one begins
 
@@ -99,13 +93,12 @@ class InertialFixedLagSmoother(MeasurementWindow):
     def __init__(
         self, imu: ImuParameters, prior: MotionPrior, *, reference_m: FloatArray, gyro_only: bool = False
     ) -> None:
-        super().__init__(InnovationMonitor(CONSISTENT_ALONE))
+        super().__init__()
         self._noise = estimation_noise(imu.noise)
         mounting = Mounting.of(imu, reference_m)
         self._mounting = replace(mounting, position=np.zeros(3)) if gyro_only else mounting
         self._prior, self._gyro_only = prior, prior if gyro_only else None
         self._initial_gravity = self._gravity = Gravity.of(imu)
-        self._health = HealthMonitor()
         self._samples: InertialSamples | None = None
         self._stale_from_s = np.inf  # Samples after this have arrived since the integration
         self._window: _Window | None = None
@@ -120,37 +113,21 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Whether there is a trajectory."""
         return self._predictor is not None
 
-    @property
-    def health(self) -> str | None:
-        """Why the IMU is not to be believed now, for people; None: it is.
-
-        A reason is given while values are stuck, beyond any range, or at the limit of an axis; where the newest sample
-        is older than 0.25 s at the time of a prediction; and when two prisms disagree with the samples within 1.2 s (one, three times
-        in succession, where none other is measured). Stuck values and values beyond any range are left out. When prisms
-        disagree, the trajectory is started anew from what comes after. The reason stays for 2 s after its last cause; then, and
-        once there is a trajectory again, the IMU is to be believed. :class:`~tsgt.geometry.inertial.health.HealthMonitor` gives the
-        grounds of the thresholds.
-        """
-        return self._health.reason
-
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""
         if not len(new):
             return
-        new = new.select(self._health.samples(new))
-        held, stuck_s = self._samples, self._health.stuck_from_s
-        parts = [each.select(each.end_s <= stuck_s) for each in (held, new) if each is not None]
-        joined = concatenate_samples(parts)
-        from_s = stuck_s
-        if len(new):
-            if held is not None and len(held) and new.end_s[0] <= held.end_s[-1]:
-                order = np.argsort(joined.end_s, kind="stable")
+        held, self._samples = self._samples, new
+        if held is not None and len(held):
+            self._samples = concatenate_samples([held, new])
+            if new.end_s[0] <= held.end_s[-1]:
+                order = np.argsort(self._samples.end_s, kind="stable")
+                ends_s = self._samples.end_s[order]
                 # The first of two of the same interval.
-                joined = joined.select(order[np.diff(joined.end_s[order], prepend=-np.inf) > 0])
-            # The gap before the first of them ends there.
-            previous = int(np.searchsorted(joined.end_s, new.end_s[0])) - 1
-            from_s = min(from_s, float(joined.end_s[previous]) if previous >= 0 else -np.inf)
-        self._samples = joined
+                self._samples = self._samples.select(order[np.diff(ends_s, prepend=-np.inf) > 0])
+        # The gap before the first of them ends there.
+        previous = int(np.searchsorted(self._samples.end_s, new.end_s[0])) - 1
+        from_s = float(self._samples.end_s[previous]) if previous >= 0 else -np.inf
         self._stale_from_s = min(self._stale_from_s, from_s)
         if self._predictor is not None:
             self._predictor.discard_after(from_s)
@@ -180,7 +157,6 @@ class InertialFixedLagSmoother(MeasurementWindow):
         scales the covariance.
         """
         assert self._predictor is not None  # noqa: S101 (only called while initialised)
-        self._health.advance(time_s)
         if time_s >= self._predictor.time_s:
             return self._predict(time_s, dim)
         return self.trajectory().at(np.array([time_s]), dim=dim)
@@ -230,7 +206,6 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
-        self._health.advance(float(new.time_s[-1]))
         if not self._converged:
             self._searched = merge_observations(self._searched, new)
         super().update(new)
@@ -243,17 +218,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._converged, self._newest_nis = False, 0.0
         self._monitor.reset(observations)
         self._discard_trajectory()
-        self.residuals_m = np.full((len(observations), 3), np.nan)
-        if self._samples is None or not len(self._samples):
-            raise GeometryError("no samples of the IMU")
-        # Before the first sample nothing links the measurements.
-        begin_s = float(self._samples.end_s[0] - self._samples.duration_s[0])
-        if observations.time_s[0] < begin_s:
-            self._horizon_s = begin_s
-            self._select(observations.time_s >= begin_s)
-            observations = observations.select(observations.time_s >= begin_s)
         searched = observations if self._searched is None else self._searched
-        searched = searched.select(searched.time_s >= begin_s)
         found = self._search(searched)
         knots = found.knots
         prior = diffuse_inertial_prior(knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only)
@@ -277,11 +242,15 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def _search(self, observations: Observations) -> InertialSolution:
         """Find the trajectory of measurements without any prior knowledge."""
+        newest_s = float(observations.time_s[-1])
+        if self._samples is None or newest_s < self._next_search_s:
+            raise GeometryError("no samples of the IMU, or too little measured since the last search")
+        # Before the first sample nothing links the measurements.
+        with_samples = observations.time_s >= self._samples.end_s[0] - self._samples.duration_s[0]
+        if not with_samples.all():
+            raise GeometryError("measurements precede the samples of the IMU")
         if len(observations) < MIN_MEASUREMENTS:
             raise GeometryError("too few measurements")
-        newest_s = float(observations.time_s[-1])
-        if newest_s < self._next_search_s:
-            raise GeometryError("too little measured since the last search")
         if len(np.unique(observations.prism)) == 1 and _path_m(observations) < MIN_PATH_M:
             raise GeometryError("one prism alone tells the heading of a robot only in motion")
         length_s = newest_s - float(observations.time_s[0])
@@ -323,9 +292,6 @@ class InertialFixedLagSmoother(MeasurementWindow):
         nis, sequential_nis = normalised_innovations(
             system.whitened[is_new], knot_index[is_new], system.gradient, solve_system
         )
-        if self._health.innovations(observations.time_s[is_new], observations.prism[is_new], nis):
-            self._samples, self._searched, self._next_search_s = None, None, -np.inf
-            return False
         weights = self._weigh(nis, sequential_nis)
         add_measurements(
             system.whitened[is_new], weights, knot_index[is_new], system.diagonal, system.gradient

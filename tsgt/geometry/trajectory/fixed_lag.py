@@ -30,7 +30,6 @@ from tsgt.geometry.trajectory.gauss_newton import (
     solve,
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
-from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
     MAX_STEPS,
@@ -72,7 +71,7 @@ class FixedLagSmoother(MeasurementWindow):
     """
 
     def __init__(self, prior: MotionPrior, setup_jacobian: SetupJacobian | None = None) -> None:
-        super().__init__(InnovationMonitor())
+        super().__init__()
         self._prior = prior
         self._common = None if setup_jacobian is None else WindowSensitivity(setup_jacobian)
         self._knots: States | None = None

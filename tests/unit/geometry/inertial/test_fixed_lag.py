@@ -176,27 +176,32 @@ def test_late_samples_and_measurements_count() -> None:
     """Within the lag the order of arrival does not matter."""
     observations = measurements()
     observations = observations.select(observations.time_s < UNTIL_S)
-    stop = int(np.searchsorted(SAMPLES.end_s, UNTIL_S + DELAY_S))
-    # Ten samples before the newest knots come after all others but the last measurement, another measurement last of all.
+    late = Live()
+    late.measure(observations.select(slice(None, -8)))
+    late.measure(observations.select(slice(-7, None)))
+    samples = SAMPLES.select(slice(len(SAMPLES)))
+    stop = int(np.searchsorted(samples.end_s, UNTIL_S + DELAY_S))
+    # Ten samples before the newest knots come after all others.
     gone = slice(stop - 150, stop - 140)
-    live = Live()
-    live.measure(observations.select(slice(None, -9)))
-    live.window.add_samples(SAMPLES.select(slice(live._sampled, gone.start)))
-    live.window.add_samples(SAMPLES.select(slice(gone.stop, stop)))
-    live._sampled = stop
-    live.measure(observations.select(slice(-8, -1)))
-    live.window.add_samples(SAMPLES.select(gone))
-    live.measure(observations.select(slice(-1, None)))
-    live.window.update(observations.select(slice(-9, -8)))
+    order = Live()
+    order.measure(observations.select(slice(None, -8)))
+    order.window.add_samples(samples.select(slice(order._sampled, gone.start)))
+    order.window.add_samples(samples.select(slice(gone.stop, stop)))
+    order._sampled = stop
+    order.measure(observations.select(slice(-8, -1)))
+    order.window.add_samples(samples.select(gone))
+    order.measure(observations.select(slice(-1, None)))
+    late.window.update(observations.select(slice(-8, -7)))
     in_order = tracked().window
     at_s = observations.time_s[-1:] - 0.05
     expected, covariance = in_order.trajectory().at(at_s)
     sigmas = np.sqrt(np.diag(covariance[0]))
-    found, _ = live.window.trajectory().at(at_s)
-    error = np.concatenate(
-        [found.position - expected.position, difference(found.rotation, expected.rotation)], axis=1
-    )
-    assert np.abs(error / sigmas).max() < 0.1
+    for live in (late, order):
+        found, _ = live.window.trajectory().at(at_s)
+        error = np.concatenate(
+            [found.position - expected.position, difference(found.rotation, expected.rotation)], axis=1
+        )
+        assert np.abs(error / sigmas).max() < 0.1
 
 
 def test_outage_is_bridged_and_tracked_on() -> None:

@@ -1,0 +1,189 @@
+"""The estimator ``continuous`` with an IMU: which trajectory poses rest on, and the order of records."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import pytest
+from harness.records import IMU_PARAMETERS, imu_samples
+from harness.scene import SECOND, START, Scene, driving, stationary_scene
+
+from tsgt.estimation import LiveEstimator
+from tsgt.estimation.imu_takeover import QUARANTINE_S, SILENCE_S, SOUND_S
+from tsgt.geometry.trajectory import FixedLagSmoother
+from tsgt.model import ImuSamples, Measurement
+from tsgt.recording import PoseRecord, encode_line
+
+if TYPE_CHECKING:
+    from tsgt.geometry.inertial import InertialSamples
+    from tsgt.model import ImuParameters, MotionPrior
+
+LINE_S = 0.05
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class FakeInertialSmoother(FixedLagSmoother):
+    """A smoother without IMU in the place of one with: its poses are 1 m higher."""
+
+    created: ClassVar[list[FakeInertialSmoother]] = []
+
+    def __init__(self, _imu: ImuParameters, prior: MotionPrior, **_: Any) -> None:
+        super().__init__(prior)
+        self.health: str | None = None
+        self.samples: list[InertialSamples] = []
+        self.created.append(self)
+
+    def add_samples(self, samples: InertialSamples) -> None:
+        """Keep samples."""
+        self.samples.append(samples)
+
+    def predict(self, time_s: float, *, dim: int = 18) -> Any:
+        """Predict as without IMU, 1 m higher."""
+        state, covariance = super().predict(time_s, dim=dim)
+        return replace(state, position=state.position + UP), covariance
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """Three stations, a robot that drives a bend, and an IMU."""
+    FakeInertialSmoother.created.clear()
+    monkeypatch.setattr("tsgt.estimation.continuous.InertialFixedLagSmoother", FakeInertialSmoother)
+    scene = stationary_scene().moving(driving).with_limits(estimator="continuous", period_ns=100_000_000)
+    return replace(scene, parameters=replace(scene.parameters, imu=IMU_PARAMETERS))
+
+
+def arrivals(
+    scene: Scene, until_s: float, silent: tuple[float, float] = (np.inf, np.inf)
+) -> list[Measurement | ImuSamples]:
+    """Measurements of the stations in turn and lines of the IMU, but for a time without, in the order of arrival."""
+    found: list[Measurement | ImuSamples] = [
+        replace(scene.measure(station, time_s + 0.1 * station), sequence=number)
+        for number, time_s in enumerate(np.arange(0.0, until_s, 0.4).tolist())
+        for station in (1, 2, 3)
+    ]
+    for line in range(round(until_s / LINE_S)):
+        record = imu_samples(10 * line)
+        if not silent[0] <= line * LINE_S < silent[1]:
+            found.append(record)
+    found = [each for each in found if each.received_ns <= START + until_s * SECOND]
+    return sorted(found, key=lambda each: each.received_ns)
+
+
+def records(scene: Scene, arrived: list[Measurement | ImuSamples]) -> list[Any]:
+    """Hand arrivals to a live estimator and return its records."""
+    live = LiveEstimator(scene.parameters)
+    return [
+        record
+        for each in arrived
+        for record in (live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each))
+    ]
+
+
+def predicted(found: list[Any]) -> list[PoseRecord]:
+    """Return the predicted poses."""
+    return [each for each in found if isinstance(each, PoseRecord) and each.kind == "predicted"]
+
+
+def time_of(pose: PoseRecord) -> float:
+    """Time of a pose from the start."""
+    return (pose.stamp_ns - START) / SECOND
+
+
+def uses_from(poses: list[PoseRecord]) -> list[tuple[str | None, float]]:
+    """Each use of the IMU, and from when."""
+    return [
+        (pose.imu, time_of(pose))
+        for before, pose in zip([None, *poses], poses, strict=False)
+        if before is None or before.imu != pose.imu
+    ]
+
+
+def test_poses_use_the_imu_once_its_trajectory_has_converged(scene: Scene) -> None:
+    """Before, they are those without it."""
+    poses = predicted(records(scene, arrivals(scene, 4.0)))
+    (starting, _), (used, from_s) = uses_from(poses)
+    assert (starting, used) == ("starting", "used")
+    assert from_s < 1.5
+    assert poses[-1].position_m is not None
+    assert poses[-1].position_m[2] == pytest.approx(0.0, abs=0.02)  # -1 m, and 1 m higher
+
+
+def test_silence_gives_the_poses_without_imu_and_sound_samples_take_it_back(scene: Scene) -> None:
+    """Within 0.5 s of the last sample, from measurements that were held; and with a jump on the pose."""
+    poses = predicted(records(scene, arrivals(scene, 4.5, silent=(2.0, 2.8))))
+    _, _, (silent, silent_s), (used, used_s) = uses_from(poses)
+    assert (silent, used) == ("silent", "used")
+    assert silent_s == pytest.approx(2.0 + SILENCE_S, abs=0.11)
+    assert used_s == pytest.approx(2.8 + SOUND_S, abs=0.16)
+    without = replace(scene, parameters=replace(scene.parameters, imu=None))
+    expected = {pose.stamp_ns: pose for pose in predicted(records(without, arrivals(scene, 4.5)))}
+    for pose in poses:
+        if silent_s <= time_of(pose) < used_s:
+            other = expected[pose.stamp_ns]
+            assert pose.valid
+            assert pose.position_m == pytest.approx(other.position_m, abs=2e-4)
+            assert pose.covariance == pytest.approx(other.covariance, rel=0.05, abs=1e-7)
+    jumps = [pose.jump_m for pose in poses if time_of(pose) in (silent_s, used_s)]
+    assert jumps == pytest.approx([1.0, 1.0], abs=0.05)
+
+
+def test_disagreement_starts_anew_and_waits(scene: Scene) -> None:
+    """Until nothing from before is in the window."""
+    arrived = arrivals(scene, 6.8)
+    live = LiveEstimator(scene.parameters)
+    poses: list[PoseRecord] = []
+    for each in arrived:
+        if each.received_ns > START + 2 * SECOND and len(FakeInertialSmoother.created) == 1:
+            FakeInertialSmoother.created[0].health = "its rates are not those of the prisms"
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    _, _, (disagrees, from_s), (used, until_s) = uses_from(poses)
+    assert (disagrees, used) == ("disagrees", "used")
+    assert from_s == pytest.approx(2.0, abs=0.16)
+    assert until_s == pytest.approx(from_s + QUARANTINE_S, abs=0.11)
+    assert len(FakeInertialSmoother.created) == 2
+
+
+def test_first_pose_after_a_measurement_states_its_jump(scene: Scene) -> None:
+    """And no other."""
+    found = records(scene, arrivals(scene, 4.0))
+    poses = [pose for pose in predicted(found) if time_of(pose) > 2.0]
+    measured = [each.received_ns for each in found if isinstance(each, Measurement)]
+    for before, pose in itertools.pairwise(poses):
+        new = any(before.stamp_ns <= at_ns < pose.stamp_ns for at_ns in measured)
+        assert (pose.jump_m is not None) == new
+        assert pose.jump_m is None or pose.jump_m < 0.05
+
+
+def test_samples_follow_the_poses_due_before_them(scene: Scene) -> None:
+    """In their place among all records, and at no instant before."""
+    live = LiveEstimator(scene.parameters)
+    live.measurement(scene.measure(1, 0.0))
+    *poses, samples = live.imu_samples(imu_samples(100))
+    assert poses
+    assert all(isinstance(pose, PoseRecord) for pose in poses)
+    assert samples == imu_samples(100)
+    (clamped,) = live.imu_samples(imu_samples(90))
+    assert clamped.received_ns == imu_samples(100).received_ns  # type: ignore[union-attr]
+
+
+def test_samples_change_nothing_without_parameters_of_an_imu(scene: Scene) -> None:
+    """Bit for bit, also the instants of measurements."""
+    without = replace(scene, parameters=replace(scene.parameters, imu=None))
+    arrived = arrivals(scene, 3.0)
+    alone = records(without, [each for each in arrived if not isinstance(each, ImuSamples)])
+    mixed = [each for each in records(without, arrived) if not isinstance(each, ImuSamples)]
+    count = min(len(alone), len(mixed))
+    assert list(map(encode_line, alone[:count])) == list(map(encode_line, mixed[:count]))
+    assert b'"imu"' not in encode_line(alone[-1])
+
+
+def test_smoother_gets_all_samples_from_before_its_measurements_on(scene: Scene) -> None:
+    """Each once, in their order."""
+    records(scene, arrivals(scene, 2.0))
+    end_s = np.concatenate([each.end_s for each in FakeInertialSmoother.created[0].samples])
+    assert np.diff(end_s) == pytest.approx(0.005, abs=1e-9)
+    assert end_s[0] < 0.0

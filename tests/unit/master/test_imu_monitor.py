@@ -1,0 +1,57 @@
+"""Events on the use of the IMU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from harness.records import POSE, SECOND, START
+
+from tsgt.master.imu_monitor import JUMP_INTERVAL_NS, ImuUseMonitor
+
+PREDICTED = replace(POSE, kind="predicted", estimator="continuous", imu="used")
+SIGMA = 1e-3  # of POSE, per axis
+
+
+def names(monitor: ImuUseMonitor, *uses: str) -> list[str]:
+    """Event names of successive poses."""
+    return [
+        event.event
+        for use in uses
+        for event in monitor.pose(replace(PREDICTED, imu=use), START)  # type: ignore[arg-type]
+    ]
+
+
+def test_use_and_loss_are_events_once() -> None:
+    """Also when the cause of a loss changes."""
+    uses = ("starting", "used", "used", "silent", "silent", "starting", "used", "disagrees")
+    assert names(ImuUseMonitor(), *uses) == ["imu_used", "imu_not_used", "imu_used", "imu_not_used"]
+
+
+def test_event_names_the_cause() -> None:
+    """In words."""
+    monitor = ImuUseMonitor()
+    monitor.pose(PREDICTED, START)
+    (event,) = monitor.pose(replace(PREDICTED, imu="disagrees"), START + SECOND)
+    assert event.stamp_ns == START + SECOND
+    assert "disagrees with the measurements" in event.message
+
+
+def test_poses_without_imu_are_ignored() -> None:
+    """And smoothed ones, which are late."""
+    monitor = ImuUseMonitor()
+    monitor.pose(PREDICTED, START)
+    assert not monitor.pose(replace(PREDICTED, imu=None), START)
+    assert not monitor.pose(replace(PREDICTED, kind="smoothed", imu="silent"), START)
+
+
+def test_jump_beyond_the_stated_sigma_is_an_event() -> None:
+    """Of the pose before the jump, and not again at once."""
+    monitor = ImuUseMonitor()
+    monitor.pose(PREDICTED, START)
+    assert not monitor.pose(replace(PREDICTED, jump_m=4.9 * SIGMA, jump_rad=0.0), START)
+    far = replace(PREDICTED, jump_m=0.0, jump_rad=5.1 * SIGMA)
+    assert [event.event for event in monitor.pose(far, START)] == ["pose_jump"]
+    assert not monitor.pose(far, START + SECOND)
+    assert monitor.pose(far, START + JUMP_INTERVAL_NS)
+    monitor.pose(replace(PREDICTED, covariance=None), START)
+    assert not monitor.pose(far, START + 3 * JUMP_INTERVAL_NS)

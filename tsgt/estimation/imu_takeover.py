@@ -1,0 +1,225 @@
+"""Takes the trajectory with the IMU while that is sound, and the one without while it is not. Sans-I/O.
+
+Both are tracked all the time from the same measurements, the one without IMU twice a second while it is not needed. So when the
+IMU falls silent or disagrees, the next poses are those of an estimator that never had one.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from tsgt.estimation.inertial import SampleConverter
+from tsgt.estimation.pose_batch import ImuUse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import InertialSamples
+    from tsgt.geometry.trajectory import Observations, States
+    from tsgt.model import ImuParameters, ImuSamples
+
+SILENCE_S = 0.3
+"""Without a sample for this long the IMU is silent. Lines of ten samples, held up by a computer under load, come sooner."""
+
+SOUND_S = 1.0
+"""How long a silent IMU must have been heard again before its trajectory is used."""
+
+QUARANTINE_S = 4.0
+"""How long an IMU that disagreed must have been sound: until the window holds nothing from before."""
+
+_KEPT_BEFORE_START_NS = 5_000_000_000  # of samples, before the first measurement
+
+
+class QueriedTrajectory(Protocol):
+    """A trajectory with its uncertainty, over the times of a window."""
+
+    def at(self, time_s: FloatArray, *, dim: int = ...) -> tuple[States, FloatArray]:
+        """Return states at N times, and the (N, dim, dim) covariance of their leading error components."""
+        ...
+
+    def common_at(self, time_s: FloatArray, *, dim: int = ...) -> FloatArray | None:
+        """Return the (N, dim, dim) covariance that the set-up's uncertainty adds; None: unknown."""
+        ...
+
+
+class TrajectoryWindow(Protocol):
+    """What poses need of a fixed-lag smoother; see :class:`~tsgt.geometry.trajectory.FixedLagSmoother`."""
+
+    @property
+    def residuals_m(self) -> FloatArray:
+        """(M, 3) of the measurements in the window, in the order of time."""
+        ...
+
+    @property
+    def horizon_s(self) -> float:
+        """Start of the window."""
+        ...
+
+    @property
+    def initialised(self) -> bool:
+        """Whether there is a trajectory."""
+        ...
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is certain enough and explains the measurements."""
+        ...
+
+    @property
+    def reliable_from_s(self) -> float:
+        """Time from which it is reliable."""
+        ...
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the newest measurements are inconsistent."""
+        ...
+
+    @property
+    def ambiguous_from_s(self) -> float:
+        """Start of the current ambiguity."""
+        ...
+
+    def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Whether the state stays ambiguous at times, (N,)."""
+        ...
+
+    def recently_ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Whether the state was ambiguous shortly before times, (N,)."""
+        ...
+
+    def update(self, new: Observations) -> None:
+        """Process measurements, in the order of time."""
+        ...
+
+    def marginalise_before(self, before_s: float) -> None:
+        """Marginalise the states before a time."""
+        ...
+
+    def predict(self, time_s: float, *, dim: int = ...) -> tuple[States, FloatArray]:
+        """Return the state at a time, given all measurements so far, with its covariance."""
+        ...
+
+    def common_at(self, time_s: float, *, dim: int = ...) -> FloatArray | None:
+        """Return the (1, dim, dim) covariance that the set-up's uncertainty adds to it; None: unknown."""
+        ...
+
+    def trajectory(self) -> QueriedTrajectory:
+        """Return the trajectory over the window."""
+        ...
+
+
+class InertialWindow(TrajectoryWindow, Protocol):
+    """The same with an IMU."""
+
+    def add_samples(self, samples: InertialSamples) -> None:
+        """Take samples that follow the earlier ones."""
+        ...
+
+
+_LOSSES = ImuUse.SILENT, ImuUse.DISAGREES
+
+
+class ImuTakeover:
+    """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
+
+    ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement. ``use``:
+    whether poses rest on the IMU, and why not.
+    """
+
+    def __init__(
+        self, imu: ImuParameters, without: TrajectoryWindow, create_with: Callable[[], InertialWindow]
+    ) -> None:
+        self._imu = imu
+        self._without = without
+        self._create_with = create_with
+        self._with = create_with()
+        self._waiting: list[Observations] = []  # for the window without IMU
+        self._converter: SampleConverter | None = None
+        self._records: deque[ImuSamples] = deque()
+        self._now_s = self._newest_s = self._sound_from_s = -np.inf
+        self.use = ImuUse.STARTING
+
+    @property
+    def window(self) -> TrajectoryWindow:
+        """The window whose trajectory is used."""
+        return self._with if self.use == ImuUse.USED else self._without
+
+    @property
+    def horizon_s(self) -> float:
+        """Start of the later window: earlier measurements are rejected."""
+        return max(self._with.horizon_s, self._without.horizon_s)
+
+    @property
+    def held(self) -> int:
+        """How many measurements the earlier window holds, which may be the next to be used."""
+        waiting = sum(len(each) for each in self._waiting)
+        return max(len(self._with.residuals_m), len(self._without.residuals_m) + waiting)
+
+    def begin(self, origin_ns: int) -> None:
+        """Fix the time origin of the observations."""
+        self._converter = SampleConverter(self._imu, origin_ns)
+
+    def add_samples(self, record: ImuSamples) -> None:
+        """Take samples; before the first measurement only the newest are kept."""
+        self._records.append(record)
+        while self._records[0].received_ns < record.received_ns - _KEPT_BEFORE_START_NS:
+            self._records.popleft()
+
+    def take_samples(self) -> None:
+        """Use the samples that were added."""
+        if self._converter is None or not self._records:
+            return
+        samples = self._converter.convert(self._records)
+        self._records.clear()
+        if len(samples):
+            self._newest_s = float(samples.end_s[-1])
+            self._with.add_samples(samples)
+
+    def update(self, new: Observations) -> None:
+        """Process measurements, in the order of time."""
+        self._with.update(new)
+        self._waiting.append(new)
+        if self.use != ImuUse.USED:
+            self._update_without()
+
+    def choose(self, now_s: float) -> None:
+        """Choose the window for poses that are sent at a time."""
+        self._now_s = now_s
+        found = self._found(now_s)
+        if found == ImuUse.DISAGREES:
+            self._with = self._create_with()
+        if found in _LOSSES:
+            self._sound_from_s = now_s + (QUARANTINE_S if found == ImuUse.DISAGREES else SOUND_S)
+        elif now_s < self._sound_from_s:
+            found = self.use
+        if found != ImuUse.USED:
+            self._update_without()
+        self.use = found
+
+    def marginalise_before(self, before_s: float) -> None:
+        """Marginalise the states before a time."""
+        self._update_without()
+        if self.use == ImuUse.USED and self._without.initialised:
+            # Its covariance follows the errors of its predictions, used or not.
+            self._without.predict(self._now_s)
+        self._without.marginalise_before(before_s)
+        self._with.marginalise_before(before_s)
+
+    def _found(self, now_s: float) -> ImuUse:
+        if now_s - self._newest_s > SILENCE_S:
+            return ImuUse.SILENT if np.isfinite(self._newest_s) else ImuUse.STARTING
+        if getattr(self._with, "health", None) is not None:  # a window that judges its IMU
+            return ImuUse.DISAGREES
+        return ImuUse.USED if self._with.initialised and self._with.converged else ImuUse.STARTING
+
+    def _update_without(self) -> None:
+        for each in self._waiting:
+            self._without.update(each)
+        self._waiting.clear()

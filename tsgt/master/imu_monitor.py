@@ -1,0 +1,79 @@
+"""Live events on the use of the robot's IMU: taken, left out with the cause, and predictions that moved too far. Sans-I/O."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.master.publisher import Observer
+from tsgt.recording import EventRecord
+
+if TYPE_CHECKING:
+    from tsgt.recording import PoseRecord
+
+MAX_JUMP_SIGMAS = 5.0
+"""Distance by which new measurements may move a prediction, in sigmas that it stated."""
+
+JUMP_INTERVAL_NS = 10_000_000_000  # at most one event
+
+_CAUSES = {
+    "starting": "its trajectory is not certain enough",
+    "silent": "there is no sample",
+    "disagrees": "it disagrees with the measurements of the prisms",
+}
+
+
+class ImuUseMonitor(Observer):
+    """Watches the predicted poses."""
+
+    def __init__(self) -> None:
+        self._use = "starting"
+        self._sigmas = (math.inf, math.inf)
+        self._next_jump_ns = -(2**63)
+
+    def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
+        """Take a pose that was published at ``now_ns``; return ``imu_used``, ``imu_not_used`` and ``pose_jump``."""
+        if record.kind != "predicted" or record.imu is None:
+            return []
+        events = self._jump(record, now_ns)
+        self._sigmas = _sigmas(record)
+        if record.imu != self._use:
+            # While it is not used its cause may change; there is one event, and one when it is used again.
+            if "used" in (record.imu, self._use):
+                events.append(_event(record.imu, now_ns))
+            self._use = record.imu
+        return events
+
+    def _jump(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
+        if record.jump_m is None or record.jump_rad is None or now_ns < self._next_jump_ns:
+            return []
+        jumps = (record.jump_m, record.jump_rad)
+        if all(jump <= MAX_JUMP_SIGMAS * sigma for jump, sigma in zip(jumps, self._sigmas, strict=True)):
+            return []
+        self._next_jump_ns = now_ns + JUMP_INTERVAL_NS
+        message = (
+            f"new measurements moved the predicted pose by {1e3 * record.jump_m:.1f} mm and "
+            f"{math.degrees(record.jump_rad):.2f} deg, more than {MAX_JUMP_SIGMAS:g} sigmas"
+        )
+        return [EventRecord(stamp_ns=now_ns, event="pose_jump", message=message)]
+
+
+def _event(use: str, now_ns: int) -> EventRecord:
+    if use == "used":
+        return EventRecord(stamp_ns=now_ns, event="imu_used", message="poses rest on the IMU")
+    message = f"poses do not rest on the IMU: {_CAUSES[use]}"
+    return EventRecord(stamp_ns=now_ns, event="imu_not_used", message=message)
+
+
+def _sigmas(record: PoseRecord) -> tuple[float, float]:
+    """Return the sigmas of position in m and rotation in rad in the least certain direction; infinite without a pose."""
+    if record.covariance is None or not record.valid:
+        return math.inf, math.inf
+    covariance = np.array(record.covariance).reshape(6, 6)
+    position, rotation = (
+        math.sqrt(max(float(np.linalg.eigvalsh(covariance[part, part])[-1]), 0.0))
+        for part in (slice(0, 3), slice(3, 6))
+    )
+    return position, rotation

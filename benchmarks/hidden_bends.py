@@ -81,9 +81,9 @@ def evaluate(name: str, recording: Recording, world: World, start_ns: int, end_n
         estimate_motion_model(observations, recording.parameters.pipeline),
     )
     for label, prior, occluded_prior in (
-        ("as found", tune(observations).prior, None),
-        ("as processed", motion.prior, configured),
-        ("as configured", configured, None),
+        ("tuned", tune(observations).prior, None),
+        ("with floor", motion.prior, configured),
+        ("configured", configured, None),
     ):
         found = fit_trajectory(
             observations, prior=prior, occluded_prior=occluded_prior, noise_scale=motion.noise_scales

@@ -10,10 +10,13 @@ import click
 import numpy as np
 
 from tsgt.analysis.design import (
+    DrivenPath,
+    InertialAccuracy,
     LayoutProblem,
     PoseAccuracy,
     RobotPoses,
     Station,
+    inertial_accuracy,
     optimal_layout,
     pose_covariances,
     station_arrangements,
@@ -22,9 +25,9 @@ from tsgt.cli.analyse.options import figure_option, read_layout, usable_layout
 from tsgt.cli.options import FiniteRange, json_option, path_type
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.progress import progress
-from tsgt.config import MasterConfig, load, parameters, scenario_parameters
+from tsgt.config import IMU_NOISE, MasterConfig, load, parameters, scenario_parameters
 from tsgt.errors import ConfigError
-from tsgt.model import MAX_COORDINATE_M
+from tsgt.model import MAX_COORDINATE_M, MIN_PRISMS, ImuParameters
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -32,12 +35,23 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.analysis.design import Criterion
-    from tsgt.config import ScenarioConfig
+    from tsgt.config import ImuModelName
     from tsgt.geometry import FloatArray
     from tsgt.model import Parameters, Vector3
 
 _DISTANCES_M = (25.0, 50.0, 100.0, 200.0, 400.0)
 _BEST = "best in the envelope"
+
+
+@dataclass(frozen=True, slots=True)
+class _Setup:
+    """What is studied: ``places``, (M, 3), of the robot, in the order of a ``route`` or not."""
+
+    known: Parameters
+    imu: ImuParameters | None
+    places: FloatArray
+    route: bool
+    source: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +113,12 @@ class _Candidate:
     default=(0.0, 0.0, 0.0),
     help="Point whose position accuracy counts, in the robot frame in m, for example of a sensor.",
 )
+@click.option(
+    "--imu",
+    "imu_class",
+    type=click.Choice(list(IMU_NOISE)),
+    help="Class of the robot's IMU, to show what each station adds to it.  [default: that of the scenario or configuration]",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the search.")
 @figure_option
 @json_option
@@ -112,6 +132,7 @@ def layout_command(
     min_separation_mm: float,
     criterion: Criterion,
     point_m: Vector3,
+    imu_class: ImuModelName | None,
     seed: int,
     figure: Path | None,
     as_json: bool,
@@ -122,6 +143,9 @@ def layout_command(
     several positions and headings, each station measures its prism once, and the instrument noise is propagated to the
     pose to first order. Then the stations are moved, to show the effect of their distance, and of placing them together
     or around the robot.
+
+    With an IMU the robot drives through the area, and the accuracy of smoothed and of live poses is shown with the first
+    station alone, with two, and so on. Fewer than three prisms have this table only.
     """
     # Comparisons with NaN are false.
     if not all(
@@ -130,12 +154,26 @@ def layout_command(
         raise click.UsageError(
             f"--area, --envelope and --point need finite numbers, at most {MAX_COORDINATE_M:g} m"
         )
-    known, places, source = _setup(scenario_name, config_path, area)
+    setup = _setup(scenario_name, config_path, area, imu_class)
+    known, places, source = setup.known, setup.places, setup.source
     slots = {prism: slot for slot, prism in enumerate(sorted({s.prism for s in known.stations}))}
     stations = tuple(
         Station(np.array(s.T_station1_station)[:3, 3], s.noise, slots[s.prism]) for s in known.stations
     )
     robot_poses, point = RobotPoses.at(places), np.array(point_m)
+    if setup.imu is not None and len(slots) < MIN_PRISMS:
+        if layouts or envelope is not None or figure is not None:
+            raise click.UsageError(
+                f"LAYOUTS, --envelope and --figure need {MIN_PRISMS} tracked prisms, the stations track {len(slots)}"
+            )
+        positions = {prism.prism: prism.position_m for prism in known.prisms}
+        layout = np.array([positions[prism] for prism in slots])
+        added = _by_stations(layout, stations, setup, setup.imu, point)
+        if as_json:
+            print_json({"point_m": point.tolist(), "with_imu": _imu_keys(added)})
+        else:
+            _print_stations(added, point, source)
+        return
     wanted = {source: _tracked({p.prism: p.position_m for p in known.prisms}, slots, source)}
     for path in layouts:
         wanted[str(path)] = _tracked(read_layout(path), slots, path)
@@ -160,6 +198,7 @@ def layout_command(
     candidates.sort(key=lambda c: c.figures.rotation_rad if criterion == "rotation" else c.figures.position_m)
     centre = places.mean(axis=0)
     distances = {d: _by_arrangement(candidates[0], stations, centre, d, point) for d in _DISTANCES_M}
+    added = {} if setup.imu is None else _by_stations(candidates[0].layout, stations, setup, setup.imu, point)
     if figure is not None:
         from tsgt.analysis.figures import draw_layouts
 
@@ -179,6 +218,7 @@ def layout_command(
                     f"{d:g}": {name: _keys(each) for name, each in found.items()}
                     for d, found in distances.items()
                 },
+                **({"with_imu": _imu_keys(added)} if added else {}),
             }
         )
         return
@@ -186,12 +226,17 @@ def layout_command(
     if envelope is not None:
         _print_best(next(c for c in candidates if c.name == _BEST), slots)
     _print_distances(candidates[0].name, distances)
+    if added:
+        click.echo()
+        _print_stations(added, point, candidates[0].name)
 
 
 def _setup(
-    scenario_name: str | None, config_path: Path | None, area: tuple[float, ...] | None
-) -> tuple[Parameters, FloatArray, str]:
-    """Return the parameters, the places of the robot, (M, 3), and the name of their source."""
+    scenario_name: str | None,
+    config_path: Path | None,
+    area: tuple[float, ...] | None,
+    imu_class: ImuModelName | None,
+) -> _Setup:
     if config_path is not None:
         if scenario_name is not None:
             raise click.UsageError("--scenario and --config exclude each other")
@@ -199,17 +244,45 @@ def _setup(
             raise click.UsageError(
                 "--config needs --area: a configuration does not define the area of the drive"
             )
-        return parameters(load(config_path, MasterConfig)), _places(area), str(config_path)
+        known = parameters(load(config_path, MasterConfig))
+        imu = known.imu
+        if imu_class is not None:
+            imu = _imu(imu_class, (0.0, 0.0, 0.0) if imu is None else imu.position_m)
+        return _Setup(known, imu, _places(area), route=False, source=str(config_path))
     scenario = find_scenario(scenario_name or "dynamic")
-    places = _places(area) if area is not None else _scenario_places(scenario)
-    return scenario_parameters(scenario), places, scenario.name
-
-
-def _scenario_places(scenario: ScenarioConfig) -> FloatArray:
+    if imu_class is not None:
+        simulated = scenario.imu.model_copy(update={"model": imu_class})
+        scenario = scenario.model_copy(update={"imu": simulated})
+    model = scenario.imu.model
+    imu = None if model == "none" else _imu(model, scenario.imu.position_m)
+    known = scenario_parameters(scenario)
+    route_m = scenario.motion.route_m
+    if area is None and route_m:
+        return _Setup(known, imu, np.array(route_m), route=True, source=scenario.name)
     motion = scenario.motion
-    if motion.route_m:
-        return np.array(motion.route_m)
-    return _places((*motion.area_centre_m, motion.area_radius_m))
+    places = _places(area or (*motion.area_centre_m, motion.area_radius_m))
+    return _Setup(known, imu, places, route=False, source=scenario.name)
+
+
+def _imu(imu_class: ImuModelName, position_m: Vector3) -> ImuParameters:
+    return ImuParameters(
+        position_m=position_m, orientation_xyzw=(0.0, 0.0, 0.0, 1.0), noise=IMU_NOISE[imu_class]
+    )
+
+
+def _by_stations(
+    layout: FloatArray,
+    stations: tuple[Station, ...],
+    setup: _Setup,
+    imu: ImuParameters,
+    point: FloatArray,
+) -> dict[int, InertialAccuracy]:
+    """Return the accuracy with the IMU and the first stations, by their number."""
+    path = DrivenPath.through(setup.places, closed=not setup.route)
+    return {
+        count: inertial_accuracy(layout, stations[:count], path, imu, point)
+        for count in range(1, len(stations) + 1)
+    }
 
 
 def _places(area: Sequence[float]) -> FloatArray:
@@ -281,6 +354,34 @@ def _print(candidates: Sequence[_Candidate], point: FloatArray, robot_poses: int
         for f in [candidate.figures]
     ]
     print_table(["layout", "position", *"xyz", "worst", "rotation", "roll", "pitch", "yaw", "worst"], rows)
+
+
+def _imu_keys(added: Mapping[int, InertialAccuracy]) -> dict[str, Any]:
+    return {
+        str(count): {"smoothed": _keys(found.smoothed), "predicted": _keys(found.predicted)}
+        for count, found in added.items()
+    }
+
+
+def _print_stations(added: Mapping[int, InertialAccuracy], point: FloatArray, name: str) -> None:
+    x, y, z = point
+    click.echo(
+        f"With the IMU and the first stations, with {name}, driving through the area: one sigma, root mean square, of the\n"
+        f"position of ({x:g}, {y:g}, {z:g}) m and of the rotation, smoothed afterwards and live (mm, mrad)\n"
+    )
+    rows = [
+        [
+            str(count),
+            *(
+                cell
+                for each in (found.smoothed, found.predicted)
+                for cell in _thousandths(each.position_m, each.rotation_rad, each.rotation_axes_rad[2])
+            ),
+        ]
+        for count, found in added.items()
+    ]
+    columns = ["position", "rotation", "yaw"]
+    print_table(["stations", *columns, *(f"live {name}" for name in columns)], rows)
 
 
 def _print_best(found: _Candidate, slots: Mapping[int, int]) -> None:

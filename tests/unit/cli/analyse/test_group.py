@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tsgt.analysis.design import inertial_study
+
 if TYPE_CHECKING:
     from harness.cli import Tsgt
 
@@ -169,6 +171,29 @@ def test_configuration_needs_an_area(tsgt: Tsgt) -> None:
     study = tsgt("analyse", "layout", "--config", config, "--area", 30, 10, 0, 20, "--json").json()
     assert study["ranking"] == [str(config)]
     assert tsgt("analyse", "layout", "--config", config).code == 2
+
+
+def test_two_stations_and_an_imu_have_a_table(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the first station alone and of both; there is nothing to rank."""
+    monkeypatch.setattr(inertial_study, "MAX_DURATION_S", 60.0)
+    arguments = ("--config", CONFIGS / "master.two-stations.example.toml", "--area", 60, 45, -1, 40)
+    found = tsgt("analyse", "layout", *arguments, "--json").json()["with_imu"]
+    assert found.keys() == {"1", "2"}
+    assert (
+        1.0 < found["2"]["smoothed"]["position_sigma_mm"] < found["1"]["smoothed"]["position_sigma_mm"] < 3.0
+    )
+    outcome = tsgt("analyse", "layout", *arguments, "--envelope", 0, 1, 0, 1, 0, 1)
+    assert (outcome.code, "--envelope and --figure need 3 tracked prisms" in outcome.err) == (2, True)
+
+
+def test_class_of_the_imu_adds_a_table(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the ranking; a route is driven along."""
+    monkeypatch.setattr(inertial_study, "MAX_DURATION_S", 60.0)
+    outcome = tsgt("analyse", "layout", "--scenario", "ski-trail", "--imu", "consumer")
+    rows = [line.split() for line in outcome.out.splitlines()[-3:]]
+    assert [row[0] for row in rows] == ["1", "2", "3"]
+    yaw = [float(row[3]) for row in rows]
+    assert yaw[0] > yaw[1] > yaw[2]
 
 
 @pytest.mark.parametrize(

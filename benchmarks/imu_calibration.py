@@ -1,6 +1,6 @@
 """Accuracy of `tsgt calibrate imu`: simulated missions with an unknown mounting, latency and device each.
 
-    python benchmarks/run.py imu_calibration industrial|consumer [--seeds 40] [--first 0] [--duration 300] [--scenario dynamic]
+    python benchmarks/run.py imu_calibration industrial|consumer [--seeds 40] [--first 0] [--duration 300] [--folder DIR]
 
 Each mission has a device of its own, mounted anywhere in any orientation, and a latency of up to 50 ms; the robot is shaken
 while it drives. Prints, per mission, the errors of rotation (deg), position (mm, the largest of x and y, and z) and latency
@@ -14,7 +14,7 @@ import argparse
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -56,28 +56,51 @@ def scenario_with_imu(name: str, model: str, seed: int) -> ScenarioConfig:
     return scenario.model_copy(update={"imu": imu, "pipeline": pipeline})
 
 
-def mission(name: str, model: str, seed: int, duration_s: float) -> tuple[FloatArray, FloatArray]:
-    """Simulate and calibrate; return errors and sigmas: rotation (3) in deg, position (3) in mm, latency in ms."""
-    scenario = scenario_with_imu(name, model, seed)
-    options = SimulationOptions(
-        duration_s=duration_s, protocol=SuperframeMasterConfig(kind="superframe"), seed=seed
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        run = simulate(scenario, options, folder=Path(folder))
-        path = run.master_logs[0].recording()
-        if path is None or run.imu is None:
-            raise SystemExit("the mission has no recording")
-        started_s = time.process_time()
-        found = calibrate_recorded_imu(load_recording(path), read_imu_samples(path))
-        cpu_s = time.process_time() - started_s
-    truth = run.imu.truth
+class RecordedMission(NamedTuple):
+    """A recording, configured without error, and the device's matrices, by which true rates and forces are multiplied."""
+
+    path: Path
+    gyro_matrix: FloatArray
+    accelerometer_matrix: FloatArray
+
+
+def recorded_mission(folder: Path, model: str, seed: int, duration_s: float) -> RecordedMission:
+    """Return the mission that a folder holds; simulate it first if it holds none."""
+    path, matrices = folder / f"{model}-{seed}.jsonl", folder / f"{model}-{seed}.npz"
+    if not matrices.exists():
+        scenario = scenario_with_imu("dynamic", model, seed)
+        options = SimulationOptions(
+            duration_s=duration_s, protocol=SuperframeMasterConfig(kind="superframe"), seed=seed
+        )
+        with tempfile.TemporaryDirectory(dir=folder) as empty:
+            run = simulate(scenario, options, folder=Path(empty))
+            recording = run.master_logs[0].recording()
+            if recording is None or run.imu is None:
+                raise SystemExit("the mission has no recording")
+            recording.rename(path)
+        truth = run.imu.truth
+        np.savez(matrices, gyro=truth.gyro_matrix, accelerometer=truth.accelerometer_matrix)
+    found = np.load(matrices)
+    return RecordedMission(path, found["gyro"], found["accelerometer"])
+
+
+def calibrated(mission: RecordedMission, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Calibrate; return errors and sigmas: rotation (3) in deg, position (3) in mm, latency in ms."""
+    started_s = time.process_time()
+    recording = load_recording(mission.path)
+    found = calibrate_recorded_imu(recording, read_imu_samples(mission.path))
+    cpu_s = time.process_time() - started_s
+    configured = found.configured
     calibration = found.calibration
     exact = in_main_axes(
         ImuSetup(
-            Mounting(truth.mounting.R_robot_imu, truth.mounting.position_m),
-            truth.latency_s,
-            np.asarray(np.linalg.inv(truth.gyro_matrix), np.float64),
-            np.asarray(np.linalg.inv(truth.accelerometer_matrix), np.float64),
+            Mounting(
+                rotation_from_quaternion(np.array(configured.orientation_xyzw)),
+                np.array(configured.position_m),
+            ),
+            configured.latency_ns / 1e9,
+            np.asarray(np.linalg.inv(mission.gyro_matrix), np.float64),
+            np.asarray(np.linalg.inv(mission.accelerometer_matrix), np.float64),
             np.zeros(3),
             calibration.setup.main_axis,
         )
@@ -86,8 +109,8 @@ def mission(name: str, model: str, seed: int, duration_s: float) -> tuple[FloatA
     error = np.concatenate(
         [
             np.degrees(log_so3(estimate @ exact.mounting.rotation.T)),
-            1e3 * (np.array(found.parameters.position_m) - truth.mounting.position_m),
-            [found.parameters.latency_ns / 1e6 - 1e3 * truth.latency_s],
+            1e3 * (np.array(found.parameters.position_m) - configured.position_m),
+            [(found.parameters.latency_ns - configured.latency_ns) / 1e6],
         ]
     )
     covariance = np.array(found.covariance.matrix)[:7, :7]
@@ -114,13 +137,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--duration", type=float, default=300.0)
-    parser.add_argument("--scenario", default="dynamic")
+    parser.add_argument("--folder", type=Path, help="keeps the recordings, and uses those that it holds")
     arguments = parser.parse_args()
     configure_logging("critical")
-    found = [
-        mission(arguments.scenario, arguments.model, seed, arguments.duration)
-        for seed in range(arguments.first, arguments.first + arguments.seeds)
-    ]
+    found = []
+    for seed in range(arguments.first, arguments.first + arguments.seeds):
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = arguments.folder or Path(temporary)
+            found.append(
+                calibrated(recorded_mission(folder, arguments.model, seed, arguments.duration), seed)
+            )
     errors, sigmas = np.array([each[0] for each in found]), np.array([each[1] for each in found])
     z = errors / sigmas
     for name, sizes, within in (

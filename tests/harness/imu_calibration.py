@@ -10,7 +10,7 @@ from harness.inertial_drive import InertialDrive, imu_parameters, inertial_drive
 from harness.records import HEADER, SECOND, START
 from scipy.spatial.transform import Rotation
 
-from tsgt.geometry import rotation_from_quaternion
+from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion
 from tsgt.geometry.inertial import Gravity, Mounting
 from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
 from tsgt.model import ImuSamples, Parameters, PointMeasurement, PrismPosition, StationParameters
@@ -94,10 +94,15 @@ def on_flat_ground(drive: InertialDrive) -> InertialDrive:
 
 def write_imu_recording(path: Path, drive: UncalibratedDrive) -> None:
     """Write a recording of a drive, configured with an IMU at the robot's origin."""
-    observations, samples = drive.observations, drive.samples
     imu = replace(drive.imu, position_m=(0.0, 0.0, 0.0), orientation_xyzw=(0.0, 0.0, 0.0, 1.0))
-    layout = observations.layout + drive.centroid_m
-    parameters = Parameters(
+    records = [HEADER, parameters_of(drive, imu), *point_measurements(drive), *imu_records(drive)]
+    path.write_bytes(b"".join(encode_line(record) + b"\n" for record in records))
+
+
+def parameters_of(drive: UncalibratedDrive, imu: ImuParameters) -> Parameters:
+    """Return the parameters of a drive with an IMU."""
+    layout = drive.observations.layout + drive.centroid_m
+    return Parameters(
         stations=tuple(StationParameters(station=number, prism=number) for number in (1, 2, 3)),
         prisms=tuple(
             PrismPosition(prism=number, position_m=tuple(position))
@@ -105,7 +110,25 @@ def write_imu_recording(path: Path, drive: UncalibratedDrive) -> None:
         ),
         imu=imu,
     )
-    records: list[object] = [HEADER, parameters]
+
+
+def calibrated_imu(drive: UncalibratedDrive) -> ImuParameters:
+    """Return the IMU of a drive as it is after a calibration without errors."""
+    truth = drive.truth
+    first, second, third = ((a, b, c) for a, b, c in truth.gyro_matrix.tolist())
+    return replace(
+        drive.imu,
+        position_m=tuple((truth.mounting.position + drive.centroid_m).tolist()),
+        orientation_xyzw=tuple(quaternion_from_rotation(truth.mounting.rotation).tolist()),
+        latency_ns=round(1e9 * truth.latency_s),
+        gyro_matrix=(first, second, third),
+    )
+
+
+def point_measurements(drive: UncalibratedDrive) -> list[PointMeasurement]:
+    """Return the measurements of a drive, received 0.2 s after their stamps."""
+    observations = drive.observations
+    records = []
     stamps_ns = START + np.round(1e9 * observations.time_s).astype(np.int64)
     for number, (stamp_ns, prism, position) in enumerate(
         zip(stamps_ns.tolist(), observations.prism.tolist(), observations.in_world().tolist(), strict=True)
@@ -120,6 +143,13 @@ def write_imu_recording(path: Path, drive: UncalibratedDrive) -> None:
                 position_m=tuple(position),
             )
         )
+    return records
+
+
+def imu_records(drive: UncalibratedDrive) -> list[ImuSamples]:
+    """Return the samples of a drive, received at their stamps."""
+    samples = drive.samples
+    records = []
     end_ns = START + np.round(1e9 * samples.end_s).astype(np.int64)
     for first in range(0, len(samples), SAMPLES_PER_LINE):
         rows = slice(first, first + SAMPLES_PER_LINE)
@@ -134,4 +164,4 @@ def write_imu_recording(path: Path, drive: UncalibratedDrive) -> None:
                 specific_force_mps2=tuple(map(tuple, samples.specific_force_mps2[rows].tolist())),
             )
         )
-    path.write_bytes(b"".join(encode_line(record) + b"\n" for record in records))
+    return records

@@ -6,6 +6,7 @@ In: raw measurements and the parameters in force. Out: poses with covariance, va
 `reference_point` carries them to another point of the robot.
 """
 
+from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, check_recorded_setup
 from tsgt.estimation.inertial import SampleConverter, inertial_samples
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
@@ -47,6 +48,7 @@ __all__ = [
     "POINT_COMMENT",
     "ContinuousPoseOutput",
     "Degradation",
+    "ImuSetupMonitor",
     "Kind",
     "LinearEstimator",
     "LiveEstimator",
@@ -60,6 +62,7 @@ __all__ = [
     "centroid_at_point",
     "centroid_m",
     "centroid_point",
+    "check_recorded_setup",
     "has_plausible_time",
     "inertial_samples",
     "instrument_time_sigma_s",

@@ -100,11 +100,6 @@ class ImuSetupMonitor:
         """Why the IMU must not be used: what is wrong in its set-up; None if nothing is known to be."""
         return "; ".join(each.text for each in self._standing.values()) or None
 
-    @property
-    def confirmed(self) -> bool:
-        """Whether a drive has shown that the set-up is right, and none since that it is wrong."""
-        return self._confirmed
-
     def take_events(self) -> Sequence[EventRecord]:
         """Return the events since the last call."""
         events, self._events = self._events, []

@@ -1,0 +1,187 @@
+"""The set-up of the IMU is checked while the robot drives; what is wrong stands until a drive rules it out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.imu_calibration import (
+    calibrated_imu,
+    imu_records,
+    parameters_of,
+    point_measurements,
+    uncalibrated_drive,
+)
+from harness.records import SECOND, START
+
+from tsgt.estimation import ImuSetupMonitor
+from tsgt.geometry import exp_so3, quaternion_from_rotation, rotation_from_quaternion
+from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
+from tsgt.model import ImuSamples, PointMeasurement
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial_calibration import Cause
+    from tsgt.model import ImuParameters, Parameters
+    from tsgt.recording import EventRecord
+
+RIGHT = SetupCheck(excluded=frozenset({"axes", "rotation", "latency", "position", "unit_of_rate"}))
+UNKNOWN = SetupCheck()
+
+
+def wrong(cause: Cause) -> SetupCheck:
+    """Return a check that finds one cause."""
+    return SetupCheck((SetupFinding(cause, 0.02, 0.001, f"{cause} is wrong"),))
+
+
+@dataclass
+class Monitored:
+    """A monitor whose checks give prepared results, fed for some time once a second."""
+
+    checks: list[SetupCheck]
+    seconds: int = 0
+
+    def __post_init__(self) -> None:
+        drive = uncalibrated_drive(1.0)
+        self.samples, self.point = imu_records(drive)[0], point_measurements(drive)[0]
+        self.monitor = ImuSetupMonitor(parameters_of(drive, drive.imu), start=self.start)
+
+    def start(self, _work: Callable[[], SetupCheck]) -> Callable[[], SetupCheck]:
+        """Give the next result."""
+        check = self.checks.pop(0) if self.checks else UNKNOWN
+        return lambda: check
+
+    def run(self, seconds: int) -> list[EventRecord]:
+        """Feed it."""
+        for _ in range(seconds):
+            now_ns = START + self.seconds * SECOND
+            self.monitor.samples(replace(self.samples, received_ns=now_ns))
+            self.monitor.measurement(replace(self.point, received_ns=now_ns))
+            self.seconds += 1
+        return list(self.monitor.take_events())
+
+
+def test_right_setup_is_confirmed_once() -> None:
+    """The first check that tells confirms; further ones add nothing."""
+    monitored = Monitored([UNKNOWN, RIGHT, RIGHT])
+    assert monitored.run(54) == []
+    (event,) = monitored.run(30)
+    assert (event.event, event.stamp_ns) == ("imu_setup_confirmed", START + 54 * SECOND)
+    assert monitored.monitor.untrusted is None
+
+
+def test_finding_stands_until_it_is_ruled_out() -> None:
+    """A wrong set-up is reported once with what to do, and a drive that does not tell leaves it."""
+    monitored = Monitored([wrong("rotation"), wrong("rotation"), UNKNOWN, RIGHT])
+    (event,) = monitored.run(60)
+    assert event.event == "imu_setup_wrong"
+    assert event.message == "rotation is wrong; calibrate it: tsgt calibrate imu"
+    assert event.stamp_ns == START + 34 * SECOND
+    assert monitored.run(30) == []
+    assert monitored.monitor.untrusted == "rotation is wrong"
+    (event,) = monitored.run(30)
+    assert event.event == "imu_setup_confirmed"
+    assert monitored.monitor.untrusted is None
+
+
+def test_knock_after_confirmation_is_reported() -> None:
+    """A set-up that was right may become wrong, and each cause is named."""
+    monitored = Monitored([RIGHT, wrong("rotation"), wrong("latency")])
+    events = monitored.run(80)
+    assert [each.event for each in events] == ["imu_setup_confirmed", "imu_setup_wrong", "imu_setup_wrong"]
+    assert monitored.monitor.untrusted == "rotation is wrong; latency is wrong"
+
+
+@dataclass
+class Setup:
+    """A drive as it is configured and as its program gives the samples."""
+
+    parameters: Parameters
+    measurements: list[PointMeasurement]
+    samples: list[ImuSamples]
+
+    def events(self) -> list[EventRecord]:
+        """Monitor the drive in the order of arrival."""
+        monitor = ImuSetupMonitor(self.parameters)
+        records: list[PointMeasurement | ImuSamples] = [*self.measurements, *self.samples]
+        for record in sorted(records, key=lambda each: each.received_ns):
+            if isinstance(record, ImuSamples):
+                monitor.samples(record)
+            else:
+                monitor.measurement(record)
+        return list(monitor.take_events())
+
+
+@cache
+def drive() -> Setup:
+    """Drive for a minute with a calibrated IMU."""
+    found = uncalibrated_drive(60.0, seed=5)
+    parameters = parameters_of(found, calibrated_imu(found))
+    return Setup(parameters, point_measurements(found), imu_records(found))
+
+
+def sampled(rates: FloatArray, forces: FloatArray) -> Setup:
+    """Return samples that are multiplied by matrices."""
+    samples = [
+        replace(
+            each,
+            angular_rate_radps=(np.array(each.angular_rate_radps) @ rates.T).tolist(),
+            specific_force_mps2=(np.array(each.specific_force_mps2) @ forces.T).tolist(),
+        )
+        for each in drive().samples
+    ]
+    return replace(drive(), samples=samples)
+
+
+def configured(change: Callable[[ImuParameters], ImuParameters]) -> Setup:
+    """Return another configuration of the IMU."""
+    imu = drive().parameters.imu
+    assert imu is not None
+    return replace(drive(), parameters=replace(drive().parameters, imu=change(imu)))
+
+
+def turned(imu: ImuParameters) -> ImuParameters:
+    """Turn the mounting by a degree about the vertical."""
+    rotation = exp_so3(np.radians([0.0, 0.0, 1.0])) @ rotation_from_quaternion(np.array(imu.orientation_xyzw))
+    x, y, z, w = quaternion_from_rotation(rotation).tolist()
+    return replace(imu, orientation_xyzw=(x, y, z, w))
+
+
+SWAPPED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("setup", "message"),
+    [
+        (lambda: configured(turned), "the mounting of the IMU is wrong by"),
+        (
+            lambda: configured(lambda imu: replace(imu, position_m=(0.21, -0.02, 0.43))),
+            "the position of the IMU is wrong by",
+        ),
+        (
+            lambda: configured(lambda imu: replace(imu, latency_ns=14_300_000)),
+            "the latency of the IMU is wrong",
+        ),
+        (lambda: sampled(SWAPPED, SWAPPED), "the axes of the IMU are swapped"),
+        (lambda: sampled(np.eye(3) * 180 / np.pi, np.eye(3)), "degrees per second"),
+        (lambda: sampled(np.eye(3), np.eye(3) / 9.81), "g instead of m/s^2"),
+        (lambda: sampled(np.eye(3), -np.eye(3)), "the specific force has the wrong sign"),
+    ],
+)
+def test_wrong_setup_is_noticed_within_a_minute(setup: Callable[[], Setup], message: str) -> None:
+    """Each is one event with its cause."""
+    (event,) = setup().events()
+    assert event.event == "imu_setup_wrong"
+    assert message in event.message
+
+
+@pytest.mark.slow
+def test_right_setup_of_a_drive_is_confirmed() -> None:
+    """No false alarm."""
+    assert [each.event for each in drive().events()] == ["imu_setup_confirmed"]

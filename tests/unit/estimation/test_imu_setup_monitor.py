@@ -69,9 +69,9 @@ class Monitored:
 def test_right_setup_is_confirmed_once() -> None:
     """The first check that tells confirms; further ones add nothing."""
     monitored = Monitored([UNKNOWN, RIGHT, RIGHT])
-    assert monitored.run(54) == []
+    assert monitored.run(46) == []
     (event,) = monitored.run(30)
-    assert (event.event, event.stamp_ns) == ("imu_setup_confirmed", START + 54 * SECOND)
+    assert (event.event, event.stamp_ns) == ("imu_setup_confirmed", START + 46 * SECOND)
     assert monitored.monitor.untrusted is None
 
 
@@ -81,8 +81,8 @@ def test_finding_stands_until_it_is_ruled_out() -> None:
     (event,) = monitored.run(60)
     assert event.event == "imu_setup_wrong"
     assert event.message == "rotation is wrong; calibrate it: tsgt calibrate imu"
-    assert event.stamp_ns == START + 34 * SECOND
-    assert monitored.run(30) == []
+    assert event.stamp_ns == START + 26 * SECOND
+    assert monitored.run(20) == []
     assert monitored.monitor.untrusted == "rotation is wrong"
     (event,) = monitored.run(30)
     assert event.event == "imu_setup_confirmed"

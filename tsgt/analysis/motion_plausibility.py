@@ -26,7 +26,7 @@ def unfit_for_live(found: SmoothedRecording) -> list[str]:
     if not found.motion.tuned:
         return []
     time_s = found.fit.observations.time_s
-    return implausibilities(found.motion.prior, moving_s=float(time_s[-1] - time_s[0]) - found.fit.rest_s)
+    return implausibilities(found.motion.prior, moving_s=float(time_s[-1] - time_s[0]) - found.rest_s)
 
 
 def implausibilities(prior: MotionPrior, *, moving_s: float) -> list[str]:

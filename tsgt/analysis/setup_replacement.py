@@ -13,7 +13,7 @@ from tsgt.model import PrismPosition
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.config import PrismLayout, StationCalibration
+    from tsgt.config import ImuMounting, PrismLayout, StationCalibration
     from tsgt.model import Parameters, SetupCovariance
 
 
@@ -58,6 +58,23 @@ def with_layout(parameters: Parameters, layout: PrismLayout, *, path: Path) -> P
         parameters,
         prisms=prisms,
         setup_covariance=_covariance(parameters, known, layout.covariance, known),
+    )
+
+
+def with_imu_mounting(parameters: Parameters, mounting: ImuMounting, *, path: Path) -> Parameters:
+    """Replace mounting, latency and gyro matrix of the IMU and their covariance by those of a set-up file.
+
+    A recording without an IMU gets that of the file. Raises ConfigError if the file does not describe it completely.
+    """
+    imu = mounting.parameters() if parameters.imu is None else mounting.applied(parameters.imu)
+    if imu is None:
+        raise ConfigError(
+            f"{path}: needs noise and gravity_mps2, because the recording has no IMU; `tsgt calibrate imu` writes them",
+            path=path,
+        )
+    known = parameters.setup_covariance
+    return dataclasses.replace(
+        parameters, imu=imu, setup_covariance=_covariance(parameters, known, known, mounting.covariance)
     )
 
 

@@ -37,14 +37,28 @@ def check_prisms_measured(parameters: Parameters, measurements: Sequence[Measure
     if not measurements:
         raise RecordingError("holds no measurements, so there is nothing to process", path=path)
     known = {station.station for station in parameters.stations}
-    seen = {m.prism for m in measurements if usable(m) and m.station in known}
+    seen = measured_prisms(parameters, measurements)
     for prism in (p.prism for p in parameters.prisms):
         if prism not in seen:
             raise RecordingError(
                 f"prism {prism} has no usable measurement ({_missing_prism_reason(prism, known, measurements, parameters)}), "
-                "and a pose needs all prisms of the layout; add its station's measurements or use a layout without it",
+                "and without an IMU a pose needs all prisms of the layout; add its station's measurements or use a layout "
+                "without it",
                 path=path,
             )
+
+
+def check_any_measured(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
+    """Raise if there is no usable measurement at all; with an IMU any prism will do."""
+    if not measured_prisms(parameters, measurements):
+        check_prisms_measured(parameters, measurements, path)
+
+
+def measured_prisms(parameters: Parameters, measurements: Sequence[Measurement]) -> set[int]:
+    """Return the prisms of the layout that have a usable measurement of a known station."""
+    known = {station.station for station in parameters.stations}
+    seen = {m.prism for m in measurements if usable(m) and m.station in known}
+    return seen & {prism.prism for prism in parameters.prisms}
 
 
 def check_time_span(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:

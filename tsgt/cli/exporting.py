@@ -22,16 +22,16 @@ from tsgt.cli.options import (
 )
 from tsgt.cli.output import refuse_overwrite, report_problem, require_extra
 from tsgt.cli.progress import TUNING, progress
-from tsgt.cli.recordings import load, load_reference, write_lines
+from tsgt.cli.recordings import imu_options, load, load_reference, resolved_point, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import records_at
-from tsgt.model import ROBOT_ORIGIN, Parameters
+from tsgt.model import ROBOT_ORIGIN, Parameters, ReferencePoint
 from tsgt.recording import PoseRecord, decode_line, read_lines, write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from tsgt.model import ReferencePoint
+    from tsgt.cli.recordings import ImuOptions
     from tsgt.recording import Kind, Recording
 
 STDOUT = Path("-")
@@ -81,6 +81,7 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
 )
 @point_option
 @reference_point_option
+@imu_options
 @keep_going_option
 def export(
     *,
@@ -91,8 +92,9 @@ def export(
     delay_s: float | None,
     reference_path: Path | None,
     output: Path,
-    point: ReferencePoint | None,
-    reference_point: ReferencePoint | None,
+    point: ReferencePoint | str | None,
+    reference_point: ReferencePoint | str | None,
+    imu: ImuOptions,
     keep_going: bool,
 ) -> None:
     """Convert a recording to TUM, CSV or MCAP.
@@ -122,11 +124,11 @@ def export(
         require_extra("MCAP files", "mcap.writer", "rosbags.typesys", extra="mcap")
     if output != STDOUT:
         refuse_overwrite([recording, reference_path], output)
-    point = point or _first_reference_point(recording)
+    point = _point(point, recording)
     if format_name == "mcap":
-        reference = load_reference(reference_path, reference_point)
-        loaded = load(recording, keep_going=keep_going, point=point)
-        poses = _poses_of(recording, series, point, keep_going=keep_going, loaded=loaded)
+        loaded = load(recording, keep_going=keep_going, point=point, imu=imu)
+        reference = load_reference(reference_path, reference_point, loaded.parameters)
+        poses = _poses_of(recording, series, point, imu, keep_going=keep_going, loaded=loaded)
         with write_atomically(output) as file:
             write_mcap(file, messages(loaded, poses, reference))
         return
@@ -134,7 +136,7 @@ def export(
     if records == "measurements":
         lines = measurement_csv(load(recording, keep_going=keep_going).measurements)
     else:
-        poses = _poses_of(recording, series, point, keep_going=keep_going, quiet=output == STDOUT)
+        poses = _poses_of(recording, series, point, imu, keep_going=keep_going, quiet=output == STDOUT)
         lines = pose_csv(poses) if format_name == "csv" else tum_lines(valid_records(poses), point)
     if output == STDOUT:
         sys.stdout.writelines(lines)
@@ -142,12 +144,18 @@ def export(
         write_lines(output, lines)
 
 
-def _first_reference_point(path: Path) -> ReferencePoint:
-    """Return the reference point of a recording's first session; the later ones are carried over to it."""
+def _point(point: ReferencePoint | str | None, path: Path) -> ReferencePoint:
+    """Return the point that is given, or else the reference point of a recording's first session.
+
+    The later sessions are carried over to it.
+    """
+    if isinstance(point, ReferencePoint):
+        return point
     for line in read_lines(path, keep_going=True):
         if line.type == "parameters":
             with suppress(CorruptLineError):  # reported, or skipped, when the poses are read
-                return decode_line(Parameters, line, path).reference_point
+                first = decode_line(Parameters, line, path)
+                return first.reference_point if point is None else resolved_point(point, first)
     return ROBOT_ORIGIN
 
 
@@ -155,6 +163,7 @@ def _poses_of(
     path: Path,
     series: str | None,
     point: ReferencePoint,
+    imu: ImuOptions,
     *,
     keep_going: bool,
     quiet: bool = False,
@@ -179,7 +188,7 @@ def _poses_of(
         raise RecordingError(f"holds no {which}; omit {option} to export or compute other poses", path=path)
     click.echo(f"{path} holds no poses; processing its measurements", err=True)
     with progress("fitting", first=TUNING) as on_progress:
-        loaded = loaded or load(path, keep_going=keep_going, point=point)
+        loaded = loaded or load(path, keep_going=keep_going, point=point, imu=imu)
         batch = process(loaded, path=path, on_progress=on_progress)
     yield from batch.records()
 

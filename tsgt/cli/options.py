@@ -100,15 +100,15 @@ def constant_m(
 
 
 class PointType(click.ParamType[Any]):
-    """A point of the robot: X,Y,Z in m, perhaps with a name and a rotation."""
+    """A point of the robot: X,Y,Z in m, perhaps with a name and a rotation; or the name alone, as text."""
 
     name = "point"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse the text; an impossible point is a usage error."""
+        """Parse the text; an impossible point is a usage error. The points that names stand for depend on the recording."""
         from tsgt.estimation import parse_reference_point
 
-        if not isinstance(value, str):
+        if not isinstance(value, str) or value.isidentifier():
             return value
         try:
             return parse_reference_point(value)
@@ -116,21 +116,21 @@ class PointType(click.ParamType[Any]):
             self.fail(str(error), param, ctx)
 
 
-POINT_METAVAR = "[NAME=]X,Y,Z[,QX,QY,QZ,QW]"
+POINT_METAVAR = "NAME|[NAME=]X,Y,Z[,QX,QY,QZ,QW]"
 
 point_option = click.option(
     "--point",
     type=PointType(),
     metavar=POINT_METAVAR,
-    help="Point of the robot whose poses are given: position in m and quaternion in the robot frame.  "
-    "[default: as recorded, else the robot's origin]",
+    help="Point of the robot whose poses are given: robot, centroid, imu (its name), or position in m and quaternion in the "
+    "robot frame.  [default: as recorded, else the robot's origin]",
 )
 
 reference_point_option = click.option(
     "--reference-point",
     type=PointType(),
     metavar=POINT_METAVAR,
-    help="Point of the robot that the reference trajectory is of.  "
+    help="Point of the robot that the reference trajectory is of, as --point.  "
     "[default: as its file states, else the robot's origin]",
 )
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
 import numpy as np
@@ -14,15 +15,16 @@ from tsgt.analysis.evaluation import noise_scales_by_axis, read_tum
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.refinement import Refine
-from tsgt.analysis.setup_replacement import with_calibration, with_layout
+from tsgt.analysis.setup_replacement import with_calibration, with_imu_mounting, with_layout
 from tsgt.cli.options import path_type
 from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
-from tsgt.config import load_prism_layout, load_station_calibration
-from tsgt.recording import RecordingHeader, encode_line, load_recording, write_atomically
+from tsgt.config import load_imu_mounting, load_prism_layout, load_station_calibration
+from tsgt.estimation import named_point
+from tsgt.recording import RecordingHeader, encode_line, load_recording, read_imu_samples, write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from tsgt.analysis.evaluation import Reference
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from tsgt.estimation import PoseBatch
     from tsgt.model import MotionPrior, Parameters, ReferencePoint
     from tsgt.recording import Recording
+
+R = TypeVar("R")
 
 estimator_option = click.option(
     "--estimator",
@@ -70,6 +74,66 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
         file.writelines(line.encode() for line in lines)
 
 
+def imu_options(command: Callable[..., R]) -> Callable[..., R]:
+    """Add the options of the robot's IMU, which a command gets as its argument ``imu``."""
+
+    @click.option("--no-imu", "left_out", is_flag=True, help="Do not use the IMU of the recording.")
+    @click.option(
+        "--imu",
+        "samples",
+        type=path_type,
+        help="Samples of the robot's IMU (tsgt import imu), instead of recorded ones.",
+    )
+    @click.option(
+        "--imu-setup",
+        "setup",
+        type=path_type,
+        help="Mounting, latency and gyro matrix of the IMU (tsgt calibrate imu) that replace the recorded ones.",
+    )
+    @functools.wraps(command)
+    def with_options(*, left_out: bool, samples: Path | None, setup: Path | None, **others: Any) -> R:
+        if left_out and (samples is not None or setup is not None):
+            raise click.UsageError(f"--no-imu and --imu{'' if samples else '-setup'} exclude each other")
+        return command(imu=ImuOptions(left_out=left_out, samples=samples, setup=setup), **others)
+
+    return with_options
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ImuOptions:
+    """How the robot's IMU is used; the default is what the recording has."""
+
+    left_out: bool = False
+    samples: Path | None = None  # instead of those of the recording
+    setup: Path | None = None
+
+    def applied(self, recording: Recording, path: Path, *, keep_going: bool) -> Recording:
+        """Return the recording with these samples and parameters."""
+        parameters = recording.parameters
+        if self.left_out:
+            parameters = dataclasses.replace(parameters, imu=None)
+        if self.setup is not None:
+            parameters = with_imu_mounting(parameters, load_imu_mounting(self.setup), path=self.setup)
+        if self.samples is None:
+            return dataclasses.replace(recording, parameters=parameters)
+        if parameters.imu is None:
+            raise click.UsageError(
+                f"{path} has no parameters of an IMU; give --imu-setup, a file of tsgt calibrate imu"
+            )
+        samples = read_imu_samples(self.samples, keep_going=keep_going, on_problem=report_problem)
+        return dataclasses.replace(recording, parameters=parameters, imu_samples=list(samples))
+
+
+def resolved_point(point: ReferencePoint | str, parameters: Parameters) -> ReferencePoint:
+    """Return a point that was given by its name or its coordinates; an unknown name is a usage error."""
+    if not isinstance(point, str):
+        return point
+    try:
+        return named_point(parameters, point)
+    except ValueError as error:
+        raise click.UsageError(f"--point: {error}") from error
+
+
 def load(
     path: Path,
     *,
@@ -78,10 +142,16 @@ def load(
     rate_hz: float | None = None,
     frames: Path | None = None,
     prisms: Path | None = None,
-    point: ReferencePoint | None = None,
+    point: ReferencePoint | str | None = None,
+    imu: ImuOptions | None = None,
 ) -> Recording:
-    """Read a recording and replace the parameters that are given."""
-    recording = load_recording(path, keep_going=keep_going, on_problem=report_problem)
+    """Read a recording, without the samples of its IMU unless ``imu`` is given, and replace the parameters that are given."""
+    own_samples = imu is not None and not imu.left_out and imu.samples is None
+    recording = load_recording(path, imu=own_samples, keep_going=keep_going, on_problem=report_problem)
+    if point is not None:
+        point = resolved_point(point, recording.parameters)
+    if imu is not None:
+        recording = imu.applied(recording, path, keep_going=keep_going)
     parameters = recording.parameters
     if rate_hz is not None:
         pipeline = dataclasses.replace(parameters.pipeline, period_ns=round(1e9 / rate_hz))
@@ -100,12 +170,16 @@ def load(
     return recording if estimator is None else with_estimator(recording, estimator)
 
 
-def load_reference(path: Path | None, point: ReferencePoint | None) -> Reference | None:
+def load_reference(
+    path: Path | None, point: ReferencePoint | str | None, parameters: Parameters
+) -> Reference | None:
     """Read a reference trajectory, of the point that is given or else of that which the file states."""
     if path is None:
         return None
     reference = read_tum(path)
-    return reference if point is None else dataclasses.replace(reference, reference_point=point)
+    if point is None:
+        return reference
+    return dataclasses.replace(reference, reference_point=resolved_point(point, parameters))
 
 
 def pose_counts(poses: PoseBatch) -> dict[str, Any]:
@@ -135,15 +209,48 @@ def motion_keys(found: SmoothedRecording) -> dict[str, Any]:
     return {
         "motion": dataclasses.asdict(motion.prior),
         "noise_scale": motion.noise_scale,
-        "noise_scales": noise_scales_by_axis(found.fit, found.sources),
+        "noise_scales": noise_scales_by_axis(found.fit.observations, motion.noise_scales, found.sources),
         "motion_tuned": motion.tuned,
         "motion_unfit_for_live": unfit_for_live(found),
     }
 
 
+def imu_keys(found: SmoothedRecording) -> dict[str, Any]:
+    """Return for ``--json`` how the IMU was used; null where it was not, for a reason or without one."""
+    if found.imu is None:
+        return {"imu": None} | ({"imu_problem": found.imu_problem} if found.imu_problem else {})
+    used = found.imu
+    return {
+        "imu": {
+            "stations": list(used.stations),
+            "samples": len(used.samples),
+            "unused_s": used.unused_s,
+            "tilt_sigma_mrad": 1e3 * used.fit.tilt_sigma_rad,
+        }
+    }
+
+
+def imu_text(found: SmoothedRecording) -> str | None:
+    """Return in words how the IMU was used; None without one."""
+    if found.imu is None:
+        return f"IMU: not used: {found.imu_problem}" if found.imu_problem else None
+    used = found.imu
+    numbers = ", ".join(map(str, used.stations))
+    text = f"IMU: used with {'station' if len(used.stations) == 1 else 'stations'} {numbers}, {len(used.samples)} samples"
+    for reason, words in (
+        ("gap", "without samples"),
+        ("contradiction", "in contradiction to the measurements"),
+    ):
+        seconds = sum(each.end_s - each.start_s for each in used.unused if each.reason == reason)
+        text += f"; {seconds:.1f} s {words}" if seconds else ""
+    return text
+
+
 def motion_text(found: SmoothedRecording, configured: MotionPrior) -> str:
     """Return motion prior and noise scale as they are written in a master's configuration; ``configured``: as recorded."""
     motion = found.motion
+    if found.imu is not None and not motion.tuned:
+        return f"Noise scale {motion.noise_scale:.3g}, estimated with the IMU; there is no motion prior"
     origin = "tuned to the measurements" if motion.tuned else "as recorded: too few measurements to tune it"
     lines = [
         f"Motion prior, {origin}:",

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from tsgt.config.files import load
 from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, StationFramesFile
-from tsgt.model import SetupCovariance, TargetResidual
+from tsgt.model import ImuParameters, SetupCovariance, TargetResidual
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
     from tsgt.config.setup import CovarianceTable, StationFrame
-    from tsgt.model import ImuParameters, Matrix4, Row4, StationParameters, Vector3
+    from tsgt.model import ImuNoise, Matrix4, Row4, StationParameters, Vector3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,25 @@ class ImuMounting:
     orientation_xyzw: Row4
     latency_ns: int
     gyro_matrix: tuple[Vector3, Vector3, Vector3]
+    # Of a file that describes the IMU completely
+    noise: ImuNoise | None = None
+    gravity_mps2: float | None = None
+    tilt_sigma_rad: float | None = None
     covariance: SetupCovariance | None = None  # None: unknown
+
+    def parameters(self) -> ImuParameters | None:
+        """Return the parameters of the IMU; None: the file has no noise, or no gravity."""
+        if self.noise is None or self.gravity_mps2 is None:
+            return None
+        imu = ImuParameters(
+            position_m=self.position_m,
+            orientation_xyzw=self.orientation_xyzw,
+            noise=self.noise,
+            gravity_mps2=self.gravity_mps2,
+        )
+        if self.tilt_sigma_rad is not None:
+            imu = dataclasses.replace(imu, tilt_sigma_rad=self.tilt_sigma_rad)
+        return self.applied(imu)
 
     def applied(self, imu: ImuParameters) -> ImuParameters:
         """Return the IMU's parameters with this calibration."""
@@ -111,6 +129,9 @@ def load_imu_mounting(path: Path) -> ImuMounting:
         orientation_xyzw=file.orientation_xyzw,
         latency_ns=round(file.latency_ms * 1e6),
         gyro_matrix=file.gyro_matrix,
+        noise=None if file.noise is None else file.noise.noise(),
+        gravity_mps2=file.gravity_mps2,
+        tilt_sigma_rad=None if file.tilt_sigma_mrad is None else file.tilt_sigma_mrad / 1e3,
         covariance=_covariance(file.covariance),
     )
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.base import Model, NotNegative, Number, NumberKey, Place, rigid
+from tsgt.config.imu import ImuNoiseConfig
 from tsgt.model import Matrix4, Row4, SetupCovariance, Vector3
 
 InstrumentErrorMrad = Annotated[float, Field(ge=-100, le=100)]
@@ -133,6 +134,12 @@ class ImuMountingFile(Model):
     """Latency from a sample to its timestamp, subtracted from it. Positive: the timestamp is late."""
     gyro_matrix: tuple[Vector3, Vector3, Vector3]
     """Scale factors and misalignment of the gyro: the angular rate is this matrix times the sample, less the bias."""
+    gravity_mps2: Annotated[float, Field(ge=9.7, le=9.9)] | None = None
+    """Gravity where the robot drove; like the next two keys for recordings of a master without the table `[imu]`."""
+    tilt_sigma_mrad: Annotated[float, Field(ge=0, le=100)] | None = None
+    """One sigma, per axis, of the angle between the z axis of station 1 and the vertical."""
+    noise: ImuNoiseConfig | None = None
+    """Noise of the samples."""
     covariance: CovarianceTable | None = None
     """Joint uncertainty of all these; none: unknown."""
 

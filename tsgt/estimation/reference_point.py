@@ -26,7 +26,7 @@ from tsgt.geometry import (
     transform_from,
 )
 from tsgt.geometry.trajectory import with_second_order_terms
-from tsgt.model import ROBOT_FRAME, ReferencePoint
+from tsgt.model import ROBOT_FRAME, ROBOT_ORIGIN, ReferencePoint
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from tsgt.estimation.pose_batch import PoseBatch
     from tsgt.geometry import FloatArray
-    from tsgt.model import Parameters
+    from tsgt.model import ImuParameters, Parameters
     from tsgt.recording import PoseRecord
 
 POINT_COMMENT = "# reference_point:"
@@ -60,6 +60,25 @@ def centroid_point(parameters: Parameters) -> ReferencePoint:
     x, y, z = centroid_m(parameters).tolist()
     axes = parameters.reference_point.orientation_xyzw
     return ReferencePoint(name="centroid", position_m=(x, y, z), orientation_xyzw=axes)
+
+
+def named_point(parameters: Parameters, name: str) -> ReferencePoint:
+    """Return a point by its name: the robot's origin, the prisms' ``centroid``, the IMU, or the recorded reference point.
+
+    Raises ValueError: there is none of this name.
+    """
+    points = {ROBOT_FRAME: ROBOT_ORIGIN, "centroid": centroid_point(parameters)}
+    if parameters.imu is not None:
+        points[parameters.imu.name] = imu_point(parameters.imu)
+    points.setdefault(parameters.reference_point.name, parameters.reference_point)
+    if name not in points:
+        raise ValueError(f"there is no point {name!r}; there are {', '.join(points)}")
+    return points[name]
+
+
+def imu_point(imu: ImuParameters) -> ReferencePoint:
+    """Return the frame of the robot's IMU."""
+    return ReferencePoint(name=imu.name, position_m=imu.position_m, orientation_xyzw=imu.orientation_xyzw)
 
 
 def centroid_at_point(parameters: Parameters) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
@@ -39,6 +39,9 @@ class Recording:
     measurements: list[Measurement]  # in the order of arrival, with merged ones at their place in the file
     end_ns: int | None
     """Latest arrival, status or event in the file, on the master's Unix clock in ns; None without any."""
+    imu_samples: list[ImuSamples] = field(
+        default_factory=list
+    )  # in the order of arrival; empty unless they were read
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,19 +100,21 @@ def read_lines(
 def load_recording(
     path: Path,
     *,
+    imu: bool = False,
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Recording:
     """Read measurements and parameters for post-processing.
 
-    ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
+    ``imu``: also read the samples of the robot's IMU. ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
     cannot be read. Raises RecordingError as :func:`read_lines`, and without parameters in the file.
     """
     header: RecordingHeader | None = None
     parameters: Parameters | None = None
     measurements: list[Measurement] = []
+    imu_samples: list[ImuSamples] = []
     end_ns: int | None = None
-    for line in read_lines(path, keep_going=keep_going, on_problem=on_problem):
+    for line in read_lines(path, imu=imu, keep_going=keep_going, on_problem=on_problem):
         known_ns: int | None = None
         try:
             match line.type:
@@ -124,6 +129,8 @@ def load_recording(
                 case "merged":
                     measurements.append(decode_line(MergedRecord, line, path).measurement)
                     known_ns = measurements[-1].received_ns
+                case "imu":
+                    imu_samples.append(decode_line(ImuSamples, line, path))
                 case "status" | "event":
                     known_ns = decode_line(_Stamped, line, path).stamp_ns
         except CorruptLineError as problem:
@@ -135,7 +142,13 @@ def load_recording(
             end_ns = known_ns if end_ns is None else max(end_ns, known_ns)
     if header is None or parameters is None:  # read_lines has checked the header
         raise RecordingError("contains no parameters; the program that wrote it ended too early", path=path)
-    return Recording(header=header, parameters=parameters, measurements=measurements, end_ns=end_ns)
+    return Recording(
+        header=header,
+        parameters=parameters,
+        measurements=measurements,
+        end_ns=end_ns,
+        imu_samples=imu_samples,
+    )
 
 
 def read_imu_samples(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.geometry.inertial import InertialFit
 from tsgt.geometry.trajectory import linearise, nearest_knots
 
 if TYPE_CHECKING:
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
     from tsgt.geometry.batch import TrajectoryFit
+    from tsgt.geometry.trajectory import Observations
     from tsgt.model import Measurement
 
 POLAR_AXES = ("range", "horizontal_angle", "zenith_angle")
@@ -63,12 +65,14 @@ class Outlier:
     sigmas: float
 
 
-def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
+def normalised_residuals(fit: TrajectoryFit | InertialFit) -> FloatArray:
     """Divide residuals by their expected sigma, (M, 3): along the line of sight, horizontally and vertically across it.
 
     NaN where a residual carries no information. The trajectory follows the measurement, so its variance there is subtracted:
     Q_vv = Q_ll - A Q_xx A^T (Baarda 1968, A testing procedure for use in geodetic networks).
     """
+    if isinstance(fit, InertialFit):
+        return np.asarray(fit.residuals_m / np.sqrt(fit.residual_variances_m2))
     at = nearest_knots(fit.trajectory.knots.time_s, fit.observations.time_s)
     linearised = linearise(fit.observations, fit.trajectory.knots, at)
     noise = np.diagonal(linearised.covariance(fit.observations), axis1=1, axis2=2)
@@ -80,7 +84,7 @@ def normalised_residuals(fit: TrajectoryFit) -> FloatArray:
 
 
 def residual_statistics(
-    fit: TrajectoryFit, sources: Sequence[Measurement]
+    fit: TrajectoryFit | InertialFit, sources: Sequence[Measurement]
 ) -> dict[int, dict[str, ResidualStatistics]]:
     """Summarise the normalised residuals by station and measured axis; ``sources``: the measurement of each observation."""
     normalised = normalised_residuals(fit)
@@ -96,20 +100,22 @@ def residual_statistics(
     return statistics
 
 
-def noise_scales_by_axis(fit: TrajectoryFit, sources: Sequence[Measurement]) -> dict[int, dict[str, float]]:
-    """Factors on the stated noise by station and measured axis, with the keys of :func:`residual_statistics`."""
+def noise_scales_by_axis(
+    observations: Observations, noise_scales: FloatArray, sources: Sequence[Measurement]
+) -> dict[int, dict[str, float]]:
+    """Factors on the stated noise, (S, 3), by station and measured axis, with the keys of :func:`residual_statistics`."""
     station = np.array([source.station for source in sources])
     factors: dict[int, dict[str, float]] = {}
     for number in np.unique(station).tolist():
-        of_station = fit.observations.select(station == number)
+        of_station = observations.select(station == number)
         factors[number] = {}
         for polar, names in ((True, POLAR_AXES), (False, POINT_AXES)):
             for row in np.unique(of_station.station[of_station.polar == polar]):
-                factors[number] |= zip(names, fit.noise_scales[row].tolist(), strict=True)
+                factors[number] |= zip(names, noise_scales[row].tolist(), strict=True)
     return factors
 
 
-def outliers(fit: TrajectoryFit, sources: Sequence[Measurement]) -> list[Outlier]:
+def outliers(fit: TrajectoryFit | InertialFit, sources: Sequence[Measurement]) -> list[Outlier]:
     """Return the measurements that the fit rejected, the worst first."""
     rows = np.flatnonzero(fit.weights < 1.0)
     return [

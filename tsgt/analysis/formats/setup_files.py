@@ -98,13 +98,23 @@ def write_prism_layout(
 
 
 def write_imu_mounting(path: Path, imu: ImuParameters, *, comment: str, covariance: SetupCovariance) -> None:
-    """Write a file of kind ``imu_mounting``, atomically. Raises OutputFileError if the file cannot be written."""
+    """Write a file of kind ``imu_mounting``, atomically, which describes the IMU completely. Raises OutputFileError if the file cannot be written."""
     content = {
         "kind": "imu_mounting",
         "position_m": list(imu.position_m),
         "orientation_xyzw": list(imu.orientation_xyzw),
         "latency_ms": imu.latency_ns / 1e6,
         "gyro_matrix": [list(row) for row in imu.gyro_matrix],
+        "gravity_mps2": imu.gravity_mps2,
+        "tilt_sigma_mrad": 1e3 * imu.tilt_sigma_rad,
+        "noise": {
+            "gyro_noise_density_radps_per_sqrt_hz": imu.noise.gyro_noise_density,
+            "accelerometer_noise_density_mps2_per_sqrt_hz": imu.noise.accelerometer_noise_density,
+            "gyro_bias_walk_radps_per_sqrt_s": imu.noise.gyro_bias_walk,
+            "accelerometer_bias_walk_mps2_per_sqrt_s": imu.noise.accelerometer_bias_walk,
+            "gyro_bias_radps": imu.noise.gyro_bias_radps,
+            "accelerometer_bias_mps2": imu.noise.accelerometer_bias_mps2,
+        },
     }
     _write(path, content, covariance, comment)
 

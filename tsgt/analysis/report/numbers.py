@@ -77,7 +77,9 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
         found |= {
             "motion": dataclasses.asdict(motion.prior),
             "noise_scale": motion.noise_scale,
-            "noise_scales": noise_scales_by_axis(f.continuous.fit, f.continuous.sources),
+            "noise_scales": noise_scales_by_axis(
+                f.continuous.fit.observations, motion.noise_scales, f.continuous.sources
+            ),
             "motion_tuned": motion.tuned,
             "motion_unfit_for_live": unfit_for_live(f.continuous),
             "residuals": {

@@ -136,11 +136,11 @@ def residual_section(f: Findings, axis: TimeAxis) -> Section:
         f"The trajectory was fitted with {motion.noise_scale:.2f} times the stated noise of the instruments"
         + (
             "; by station and component in the table. Errors of the set-up count as noise here."
-            if motion.tuned
+            if motion.tuned or f.continuous.imu is not None
             else ", as recorded: there are too few measurements to estimate it."
         ),
     )
-    factors = noise_scales_by_axis(f.continuous.fit, f.continuous.sources)
+    factors = noise_scales_by_axis(f.continuous.fit.observations, motion.noise_scales, f.continuous.sources)
     rows = [
         (
             f"{station} {_COMPONENTS.get(component, component.replace('_', ' '))}",

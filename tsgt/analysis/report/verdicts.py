@@ -193,7 +193,7 @@ def _distances(f: Findings) -> Iterator[Verdict]:
 
 
 def _motion(f: Findings) -> Iterator[Verdict]:
-    if f.continuous is not None and not f.continuous.motion.tuned:
+    if f.continuous is not None and f.continuous.imu is None and not f.continuous.motion.tuned:
         yield Verdict(
             Level.CARE,
             "There are too few measurements to estimate motion prior and noise scale: both are those of the recording.",

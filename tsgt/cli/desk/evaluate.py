@@ -36,6 +36,9 @@ from tsgt.cli.recordings import (
     duration_s,
     estimator_option,
     frames_option,
+    imu_keys,
+    imu_options,
+    imu_text,
     load,
     load_reference,
     motion_keys,
@@ -64,6 +67,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.refinement import Refine
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.cli.desk.reference import Comparison
+    from tsgt.cli.recordings import ImuOptions
     from tsgt.model import ReferencePoint
     from tsgt.recording import Recording
 
@@ -109,6 +113,7 @@ LISTED_OUTLIERS = 10
 @frames_option
 @prisms_option
 @refine_option
+@imu_options
 @keep_going_option
 @json_option
 def evaluate(
@@ -116,8 +121,8 @@ def evaluate(
     recording: Path,
     estimator: Estimator | None,
     reference_path: Path | None,
-    point: ReferencePoint | None,
-    reference_point: ReferencePoint | None,
+    point: ReferencePoint | str | None,
+    reference_point: ReferencePoint | str | None,
     align: Literal["none", "translation", "rigid"],
     with_held_out: bool | None,
     report_folder: Path | None,
@@ -125,6 +130,7 @@ def evaluate(
     frames: Path | None,
     prisms: Path | None,
     refine: Refine,
+    imu: ImuOptions,
     keep_going: bool,
     as_json: bool,
 ) -> None:
@@ -144,9 +150,15 @@ def evaluate(
     if report_folder is not None:
         require_extra("reports", "matplotlib", "jinja2", extra="report")
     loaded = load(
-        recording, keep_going=keep_going, estimator=estimator, frames=frames, prisms=prisms, point=point
+        recording,
+        keep_going=keep_going,
+        estimator=estimator,
+        frames=frames,
+        prisms=prisms,
+        point=point,
+        imu=imu,
     )
-    reference = load_reference(reference_path, reference_point)
+    reference = load_reference(reference_path, reference_point, loaded.parameters)
     if report_folder is not None:
         report_evaluation(
             loaded,
@@ -195,6 +207,7 @@ def evaluate(
                 **({} if predicted is None else {"held_out_mm": _held_out_keys(predicted)}),
                 **refinement_keys(continuous.refinement, continuous.parameters),
                 **motion_keys(continuous),
+                **imu_keys(continuous),
                 "residuals": {
                     station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
                     for station, axes in residuals.items()
@@ -224,6 +237,9 @@ def evaluate(
         click.echo("\nHeld-out prediction error (mm)")
         _print_held_out(predicted)
     click.echo(f"\n{refinement_text(continuous.refinement, continuous.parameters)}")
+    used = imu_text(continuous)
+    if used is not None:
+        click.echo(f"\n{used}")
     click.echo(f"\n{motion_text(continuous, parameters.pipeline.motion)}")
     click.echo("\nNormalised residuals of the continuous trajectory")
     rows = [

@@ -27,6 +27,9 @@ from tsgt.cli.recordings import (
     duration_s,
     estimator_option,
     frames_option,
+    imu_keys,
+    imu_options,
+    imu_text,
     load,
     motion_keys,
     motion_text,
@@ -45,6 +48,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.refinement import Refine
     from tsgt.analysis.smoothing import SmoothedRecording
+    from tsgt.cli.recordings import ImuOptions
     from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters, ReferencePoint
     from tsgt.recording import Recording
@@ -75,6 +79,7 @@ FORMATS = {".tum": "tum", ".jsonl": "jsonl", ".json": "jsonl", ".csv": "csv"}
     help="File to write: .tum, .jsonl or .csv; replaced if it exists.",
 )
 @refine_option
+@imu_options
 @keep_going_option
 @json_option
 def process(
@@ -84,22 +89,24 @@ def process(
     rate_hz: float | None,
     frames: Path | None,
     prisms: Path | None,
-    point: ReferencePoint | None,
+    point: ReferencePoint | str | None,
     format_name: str | None,
     output: Path,
     refine: Refine,
+    imu: ImuOptions,
     keep_going: bool,
     as_json: bool,
 ) -> None:
     """Compute poses from a recording.
 
     Uses all measurements of RECORDING in the order of their timestamps, including those that arrived late or were
-    merged.
+    merged. With samples of the robot's IMU the estimator continuous uses these, too, and the measurements of two stations, or
+    of one, are enough.
     """
     format_name = format_name or FORMATS.get(output.suffix)
     if format_name is None:
         raise click.UsageError(f"{unknown_suffix(output, tuple(FORMATS))}; or give --format")
-    refuse_overwrite([recording, frames, prisms], output)
+    refuse_overwrite([recording, frames, prisms, imu.samples, imu.setup], output)
     started_s = time.perf_counter()
     loaded = load(
         recording,
@@ -109,6 +116,7 @@ def process(
         frames=frames,
         prisms=prisms,
         point=point,
+        imu=imu,
     )
     poses, parameters, continuous = _processed(loaded, recording, refine)
     with progress("writing poses") as on_progress:
@@ -133,8 +141,9 @@ def process(
             if continuous is None
             else {
                 **motion_keys(continuous),
+                **imu_keys(continuous),
                 **refinement_keys(continuous.refinement, continuous.parameters),
-                "rest_s": continuous.fit.rest_s,
+                "rest_s": continuous.rest_s,
             }
         ),
     }
@@ -145,8 +154,12 @@ def process(
     click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements, at {at}")
     if continuous is not None:
         click.echo(refinement_text(continuous.refinement, continuous.parameters))
+        used = imu_text(continuous)
+        if used is not None:
+            click.echo(used)
         click.echo(motion_text(continuous, loaded.parameters.pipeline.motion))
-        click.echo(f"At rest: {continuous.fit.rest_s:.1f} s in {len(continuous.fit.rest)} intervals")
+        if continuous.imu is None:
+            click.echo(f"At rest: {continuous.rest_s:.1f} s in {len(continuous.rest)} intervals")
 
 
 def _processed(

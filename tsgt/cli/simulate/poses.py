@@ -25,12 +25,12 @@ from tsgt.analysis.processing import Estimator, process, with_estimator
 from tsgt.errors import DegenerateGeometryError, RecordingError
 from tsgt.estimation import PoseBatch, build_tracks, centroid_at_point, sigma_limits_of
 from tsgt.geometry import rotation_from_quaternion, transform_from
-from tsgt.recording import Recording, RecordingHeader
+from tsgt.recording import Recording, RecordingHeader, read_imu_samples
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.model import Measurement
+    from tsgt.model import ImuSamples, Measurement
     from tsgt.simulation.mission import MissionResult
 
 
@@ -66,6 +66,7 @@ def estimator_figures(run: MissionResult) -> dict[Estimator, EstimatorFigures]:
         parameters=run.parameters,
         measurements=measurements,
         end_ns=max((m.received_ns for m in measurements), default=None),
+        imu_samples=_imu_samples(run),
     )
     return {name: _processed_figures(run, with_estimator(recording, name)) for name in get_args(Estimator)}
 
@@ -80,6 +81,26 @@ def _measurements(run: MissionResult) -> list[Measurement]:
             if later_ns
             else m
             for m in session.measurements
+        ]
+    return found
+
+
+def _imu_samples(run: MissionResult) -> list[ImuSamples]:
+    """Return the recorded samples of the IMU on one clock, as the measurements."""
+    found: list[ImuSamples] = []
+    for session in run.master_logs:
+        path = session.recording()
+        if run.parameters.imu is None or path is None:
+            continue
+        later_ns = run.start_ns - session.unix_at_zero_ns
+        found += [
+            replace(
+                each,
+                received_ns=each.received_ns + later_ns,
+                stamp_ns=tuple(stamp_ns + later_ns for stamp_ns in each.stamp_ns),
+            )
+            # The line that a power cut tore is not of interest here.
+            for each in read_imu_samples(path, keep_going=True)
         ]
     return found
 

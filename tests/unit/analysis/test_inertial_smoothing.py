@@ -1,0 +1,121 @@
+"""Smoothing of recordings with an IMU: from three stations, two and one, and where the IMU is not to be used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.imu_recording import IMU, imu_recording, shaken_drive, true_positions_m
+from harness.records import START
+from scipy.spatial.transform import Rotation
+
+from tsgt.analysis.smoothing import smooth_recording
+from tsgt.errors import DegenerateGeometryError, RecordingError
+from tsgt.estimation import named_point
+from tsgt.model import SetupCovariance
+
+if TYPE_CHECKING:
+    from tsgt.analysis.smoothing import SmoothedRecording
+    from tsgt.geometry import FloatArray
+    from tsgt.recording import Recording
+
+PATH = Path("field.jsonl")
+DRIVE = shaken_drive(26.0)
+MARGIN = 40  # Epochs at either end
+
+
+def smooth(recording: Recording) -> SmoothedRecording:
+    """Smooth without refinement, which takes most of the time."""
+    return smooth_recording(recording, path=PATH, refine="off")
+
+
+def position_errors_m(found: SmoothedRecording) -> FloatArray:
+    """Errors of the robot's origin at valid poses, (N,)."""
+    poses = found.poses.select(found.poses.valid)
+    errors: FloatArray = np.linalg.norm(
+        poses.position_m - true_positions_m(DRIVE, poses.stamp_ns.astype(np.float64)), axis=1
+    )
+    return errors[MARGIN:-MARGIN]
+
+
+@pytest.mark.parametrize(("stations", "limit_mm"), [(3, 1.2), (2, 1.6), (1, 3.0)])
+def test_stations_and_an_imu_suffice(stations: int, limit_mm: float) -> None:
+    """All poses are valid, and more exact than three stations give without an IMU."""
+    found = smooth(imu_recording(DRIVE, stations=stations))
+    assert found.imu is not None
+    assert found.imu.stations == tuple(range(1, stations + 1))
+    assert found.poses.valid[MARGIN:-MARGIN].all()
+    assert 1e3 * np.sqrt((position_errors_m(found) ** 2).mean()) < limit_mm
+    assert 0.8 < found.motion.noise_scale < 1.2
+
+
+def test_two_stations_without_samples_are_an_error() -> None:
+    """The error of today, which names the IMU."""
+    recording = replace(imu_recording(DRIVE, stations=2), imu_samples=[])
+    with pytest.raises(DegenerateGeometryError, match="an IMU"):
+        smooth(recording)
+
+
+def test_imu_that_contradicts_the_measurements_is_left_out() -> None:
+    """Poses are those of the stations alone, with the reason."""
+    x, y, z, w = (Rotation.from_quat(IMU.orientation_xyzw) * Rotation.from_rotvec([0.0, 0.08, 0.0])).as_quat()
+    wrong = replace(IMU, orientation_xyzw=(x, y, z, w))
+    found = smooth(imu_recording(DRIVE, imu=wrong))
+    assert found.imu is None
+    assert "the bias of the accelerometer would be" in found.imu_problem
+    assert 1e3 * np.sqrt((position_errors_m(found) ** 2).mean()) < 6.0
+
+
+def test_samples_of_another_day_are_an_error_of_two_stations() -> None:
+    """Which says how to go on."""
+    recording = imu_recording(DRIVE, stations=2)
+    later = [
+        replace(each, stamp_ns=tuple(stamp_ns + 10**14 for stamp_ns in each.stamp_ns))
+        for each in recording.imu_samples
+    ]
+    with pytest.raises(RecordingError, match="another time than the measurements; --no-imu"):
+        smooth(replace(recording, imu_samples=later))
+
+
+def test_gap_of_the_samples_has_the_poses_of_the_stations_alone() -> None:
+    """No valid pose there is worse than without an IMU."""
+    recording = imu_recording(DRIVE)
+    missing = [
+        each for each in recording.imu_samples if not 10 * 10**9 < each.stamp_ns[0] - START < 13 * 10**9
+    ]
+    found = smooth(replace(recording, imu_samples=missing))
+    alone = smooth(replace(recording, imu_samples=[]))
+    assert found.imu is not None
+    (gap,) = found.imu.unused
+    assert gap.reason == "gap"
+    assert (gap.start_s, gap.end_s) == pytest.approx((10.5, 13.0), abs=1.0)
+    np.testing.assert_array_equal(np.diff(found.poses.stamp_ns), 50_000_000)
+    time_s = (found.poses.stamp_ns - int(recording.measurements[0].stamp_ns)) / 1e9
+    inside = (time_s > gap.start_s) & (time_s < gap.end_s)
+    assert inside.sum() > 30
+    np.testing.assert_array_equal(found.poses.position_m[inside], alone.poses.position_m[inside])
+
+
+def test_set_up_is_a_common_part_of_the_covariance() -> None:
+    """As without an IMU: a second station that is uncertain by 2 mm shows in every pose."""
+    recording = imu_recording(DRIVE, stations=2)
+    known = SetupCovariance(components=("station2.x",), matrix=((4e-6,),))
+    found = smooth(
+        replace(recording, parameters=replace(recording.parameters, setup_covariance=known))
+    ).poses.covariance_common[MARGIN:-MARGIN]
+    assert np.sqrt(found[:, 0, 0]).min() > 0.2e-3
+    assert np.sqrt(found[:, 0, 0]).max() < 4e-3
+
+
+def test_poses_of_the_imu_are_those_of_its_frame() -> None:
+    """Its origin is one of the points that have a name."""
+    recording = imu_recording(DRIVE, stations=2)
+    point = named_point(recording.parameters, "imu")
+    found = smooth(replace(recording, parameters=replace(recording.parameters, reference_point=point))).poses
+    position, rotation = DRIVE.pose_at((found.stamp_ns - START) / 1e9)
+    expected = position + rotation @ np.array(IMU.position_m)
+    error_m = np.linalg.norm(found.position_m - expected, axis=1)[MARGIN:-MARGIN]
+    assert 1e3 * np.sqrt((error_m**2).mean()) < 2.0

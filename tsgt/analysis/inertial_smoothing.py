@@ -1,0 +1,183 @@
+"""The robot's IMU in the smoothing of a recording: the fit with it, and where it is not to be used. Sans-I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.errors import GeometryError
+from tsgt.estimation import centroid_m, inertial_samples, setup_jacobian
+from tsgt.geometry.batch import overall_scale, scale_noise
+from tsgt.geometry.inertial import fit_inertial_trajectory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import InertialFit, InertialSamples
+    from tsgt.geometry.trajectory import Observations, SetupJacobian
+    from tsgt.model import ImuNoise, ImuSamples, Parameters
+
+MAX_GAP_S = 0.5
+"""Samples that are missing for longer are worse than the motion prior, which a pose without the IMU has instead."""
+
+WINDOW_S = 10.0  # In which the measurements are compared with the trajectory
+MAX_SQUARE = 9.0  # Of a normalised residual: one outlier does not condemn the IMU
+MAX_MEAN_SQUARE = 2.5
+"""Mean square of the normalised residuals, 1 if samples and measurements agree. A mounting 2 degrees off makes it 6."""
+MIN_COMPONENTS = 24  # Of residuals in a window: eight measurements
+MAX_CONTRADICTED = 0.5  # Share of the windows beyond which the IMU is not used at all
+
+MAX_BIAS_SIGMAS = 8.0
+"""Bias in sigmas of the data sheet. A mounting that is off by an angle passes for a bias of this angle times gravity."""
+
+NOISE_SCALE_PRIOR = 30.0
+"""Components as many as the prior on a factor on the noise is worth; the factor 1 is that of the data sheet."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnusedInterval:
+    """A time in which the IMU was not used, in s on the time axis of the observations."""
+
+    start_s: float
+    end_s: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ImuUse:
+    """An IMU that was used in the smoothing of a recording."""
+
+    stations: tuple[int, ...]  # whose measurements were used with it
+    samples: InertialSamples
+    fit: InertialFit
+    noise_scales: FloatArray  # (S + 1, 3) factors on the stated noise of the measurements
+    noise_scale: float  # Their root mean square over all measurements and components
+    unused: tuple[UnusedInterval, ...]
+
+    def unused_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """(N,) whether the IMU is not to be used at times."""
+        found = np.zeros(len(time_s), np.bool_)
+        for each in self.unused:
+            found |= (time_s >= each.start_s) & (time_s <= each.end_s)
+        return found
+
+    @property
+    def unused_s(self) -> float:
+        """Total time in which it was not used."""
+        return sum(each.end_s - each.start_s for each in self.unused)
+
+
+def fit_with_imu(
+    parameters: Parameters,
+    observations: Observations,
+    records: Iterable[ImuSamples],
+    *,
+    origin_ns: int,
+    noise_scales: FloatArray,
+    tuned: bool,
+    on_progress: Callable[[float], None] | None = None,
+) -> ImuUse:
+    """Fit a trajectory to observations, with their stated noise, and to the samples of the IMU.
+
+    ``noise_scales``: factors on the noise, (S + 1, 3); unless ``tuned`` they are estimated here. Raises GeometryError: the
+    samples do not belong to the measurements or contradict them, or no trajectory fits.
+    """
+    imu = parameters.imu
+    assert imu is not None  # noqa: S101 (the caller checks)
+    samples = inertial_samples(records, imu, origin_ns)
+    start_s, end_s = float(observations.time_s[0]), float(observations.time_s[-1])
+    if not len(samples) or samples.end_s[-1] < start_s or samples.end_s[0] > end_s:
+        raise GeometryError("the samples of the IMU are from another time than the measurements")
+
+    def fitted(scales: FloatArray, by_setup: SetupJacobian | None = None) -> InertialFit:
+        return fit_inertial_trajectory(
+            scale_noise(observations, scales),
+            samples,
+            imu,
+            reference_m=centroid_m(parameters),
+            setup_jacobian=by_setup,
+            on_progress=on_progress,
+        )
+
+    if not tuned:
+        noise_scales = noise_scales * estimated_noise_scales(fitted(noise_scales))
+    found = fitted(noise_scales, setup_jacobian(parameters))
+    contradicted = contradicted_windows(found)
+    windows = max((end_s - start_s) / WINDOW_S, 1.0)
+    if len(contradicted) > MAX_CONTRADICTED * windows:
+        raise GeometryError(
+            "the samples of the IMU contradict the measurements: its mounting, its latency or its axes are wrong, or it is loose; "
+            "calibrate it (tsgt calibrate imu)"
+        )
+    _check_biases(found, imu.noise)
+    numbers = [station.station for station in parameters.stations]
+    return ImuUse(
+        tuple(numbers[row] for row in np.unique(observations.station) if row < len(numbers)),
+        samples,
+        found,
+        noise_scales,
+        overall_scale(observations, noise_scales),
+        (*gaps(samples, start_s, end_s), *contradicted),
+    )
+
+
+def _check_biases(fit: InertialFit, noise: ImuNoise) -> None:
+    """Raise GeometryError if a bias is larger than such a device has."""
+    knots = fit.trajectory.knots
+    for name, biases, sigma, unit in (
+        ("gyro", knots.gyro_bias, noise.gyro_bias_radps, "rad/s"),
+        ("accelerometer", knots.bias_or_acceleration, noise.accelerometer_bias_mps2, "m/s^2"),
+    ):
+        bias = float(np.abs(np.median(biases, axis=0)).max())
+        if bias > MAX_BIAS_SIGMAS * sigma:
+            raise GeometryError(
+                f"the samples of the IMU contradict the measurements, or its noise is not as configured: the bias of the {name} "
+                f"would be {bias:.2g} {unit}, {bias / sigma:.0f} sigmas of its data sheet; check its mounting (tsgt calibrate imu)"
+            )
+
+
+def estimated_noise_scales(fit: InertialFit) -> FloatArray:
+    """Factors on the noise of a fit by station and component, (S, 3), from its residuals and their expected squares.
+
+    One step of the estimation of variance components (W. Foerstner, 1979), with a prior; outliers are left out.
+    """
+    observations = fit.observations
+    squares, expected = (
+        np.full((len(observations.frames), 3), NOISE_SCALE_PRIOR),
+        np.full((len(observations.frames), 3), NOISE_SCALE_PRIOR),
+    )
+    variances = observations.sigmas_m**2
+    known = np.isfinite(fit.residual_variances_m2) & (fit.weights == 1.0)[:, None]
+    np.add.at(squares, observations.station, np.where(known, fit.residuals_m**2 / variances, 0.0))
+    np.add.at(expected, observations.station, np.where(known, fit.residual_variances_m2 / variances, 0.0))
+    scales: FloatArray = np.sqrt(squares / expected)
+    return scales
+
+
+def contradicted_windows(fit: InertialFit) -> list[UnusedInterval]:
+    """Return the windows in which the measurements do not fit the trajectory with the IMU."""
+    time_s = fit.observations.time_s
+    squares = np.minimum(fit.residuals_m**2 / fit.residual_variances_m2, MAX_SQUARE)
+    known = np.isfinite(squares)
+    window = ((time_s - time_s[0]) // WINDOW_S).astype(np.int64)
+    total = np.bincount(window, np.where(known, squares, 0.0).sum(axis=1))
+    count = np.bincount(window, known.sum(axis=1))
+    wrong = (count >= MIN_COMPONENTS) & (total > MAX_MEAN_SQUARE * count)
+    starts_s = time_s[0] + WINDOW_S * np.flatnonzero(wrong)
+    return [UnusedInterval(start_s, start_s + WINDOW_S, "contradiction") for start_s in starts_s.tolist()]
+
+
+def gaps(samples: InertialSamples, start_s: float, end_s: float) -> list[UnusedInterval]:
+    """Return the intervals between ``start_s`` and ``end_s`` without samples for longer than :data:`MAX_GAP_S`."""
+    begins_s = np.append(samples.end_s - samples.duration_s, np.inf)
+    ends_s = np.append(-np.inf, samples.end_s)
+    rows = np.flatnonzero(np.minimum(begins_s, end_s) - np.maximum(ends_s, start_s) > MAX_GAP_S)
+    return [
+        UnusedInterval(float(max(ends_s[row], start_s)), float(min(begins_s[row], end_s)), "gap")
+        for row in rows
+    ]

@@ -105,9 +105,9 @@ def imu_label(imu: ImuStatus) -> tuple[str, bool]:
         return f"SILENT {duration(imu.age_s)}", False
     if imu.problem:
         return "CHECK IT", False
-    if imu.disagreement:
+    if imu.use == "disagrees" or imu.disagreement:
         return "DISAGREES WITH THE PRISMS", False
-    return ("NOT IN USE YET" if imu.in_use is False else "OK"), True
+    return ("NOT IN USE YET" if imu.use == "starting" else "OK"), True
 
 
 def _imu_lines(imu: ImuStatus) -> list[str]:

@@ -32,7 +32,7 @@ from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tsgt.estimation.imu_takeover import TrajectoryWindow
+    from tsgt.estimation.imu_takeover import ImuState, TrajectoryWindow
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import States
     from tsgt.model import ImuSamples, Measurement, Parameters
@@ -80,6 +80,10 @@ class ContinuousEstimator:
         self._delays_ns = np.array(sorted(self._limits.smoothed_delays_ns, reverse=True), dtype=np.int64)
         self.outside_lag_window: Counter[int] = Counter()
         self._none = PoseBatch.blank(none, tuple(self._columns), Kind.PREDICTED)
+
+    def imu_state(self) -> ImuState | None:
+        """Return what is known of the IMU; None without one."""
+        return None if self._imu is None else self._imu.state()
 
     @property
     def _window(self) -> TrajectoryWindow:

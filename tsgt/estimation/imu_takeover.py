@@ -7,7 +7,7 @@ IMU falls silent or disagrees, the next poses are those of an estimator that nev
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import InertialSamples
     from tsgt.geometry.trajectory import Observations, States
-    from tsgt.model import ImuParameters, ImuSamples
+    from tsgt.model import ImuParameters, ImuSamples, Vector3
 
 SILENCE_S = 0.3
 """Without a sample for this long the IMU is silent. Lines of ten samples, held up by a computer under load, come sooner."""
@@ -118,9 +118,23 @@ class TrajectoryWindow(Protocol):
 class InertialWindow(TrajectoryWindow, Protocol):
     """The same with an IMU."""
 
+    @property
+    def biases(self) -> tuple[FloatArray, FloatArray | None] | None:
+        """Newest biases of gyro and accelerometer, (3,) each; None where unknown."""
+        ...
+
     def add_samples(self, samples: InertialSamples) -> None:
         """Take samples that follow the earlier ones."""
         ...
+
+
+class ImuState(NamedTuple):
+    """What the estimator knows of the IMU: whether poses rest on it, why it disagrees, and its biases as in the status."""
+
+    use: ImuUse
+    disagreement: str
+    gyro_bias_radps: Vector3 | None
+    accelerometer_bias_mps2: Vector3 | None
 
 
 _LOSSES = ImuUse.SILENT, ImuUse.DISAGREES
@@ -145,11 +159,19 @@ class ImuTakeover:
         self._records: deque[ImuSamples] = deque()
         self._now_s = self._newest_s = self._sound_from_s = -np.inf
         self.use = ImuUse.STARTING
+        self._disagreement = ""
 
     @property
     def window(self) -> TrajectoryWindow:
         """The window whose trajectory is used."""
         return self._with if self.use == ImuUse.USED else self._without
+
+    def state(self) -> ImuState:
+        """Return what is known of the IMU now."""
+        biases = self._with.biases if self._with.converged else None
+        gyro, accelerometer = (None, None) if biases is None else biases
+        disagreement = self._disagreement if self.use == ImuUse.DISAGREES else ""
+        return ImuState(self.use, disagreement, _vector(gyro), _vector(accelerometer))
 
     @property
     def horizon_s(self) -> float:
@@ -194,6 +216,7 @@ class ImuTakeover:
         self._now_s = now_s
         found = self._found(now_s)
         if found == ImuUse.DISAGREES:
+            self._disagreement = str(getattr(self._with, "health", "") or "")
             self._with = self._create_with()
         if found in _LOSSES:
             self._sound_from_s = now_s + (QUARANTINE_S if found == ImuUse.DISAGREES else SOUND_S)
@@ -223,3 +246,10 @@ class ImuTakeover:
         for each in self._waiting:
             self._without.update(each)
         self._waiting.clear()
+
+
+def _vector(values: FloatArray | None) -> Vector3 | None:
+    if values is None:
+        return None
+    x, y, z = values.tolist()
+    return x, y, z

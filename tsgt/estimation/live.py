@@ -15,6 +15,7 @@ from tsgt.estimation.linear import LinearEstimator
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from tsgt.estimation.imu_takeover import ImuState
     from tsgt.model import ImuSamples, Measurement, Parameters
     from tsgt.recording import PoseRecord
 
@@ -65,6 +66,10 @@ class LiveEstimator:
         return (
             self._estimator.outside_lag_window if isinstance(self._estimator, ContinuousEstimator) else None
         )
+
+    def imu_state(self) -> ImuState | None:
+        """Return what the estimator knows of the IMU; None if it uses none."""
+        return self._estimator.imu_state() if isinstance(self._estimator, ContinuousEstimator) else None
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`advance` has to be called if nothing arrives before; None while nothing is due."""

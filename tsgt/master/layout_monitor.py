@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from tsgt.master.publisher import Observer
+from tsgt.model import MIN_PRISMS
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
@@ -74,8 +75,8 @@ class LayoutMonitor(Observer):
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
         """Take a pose that was published at ``now_ns``; return ``layout_residual_high`` or ``layout_residual_normal`` on a change.
 
-        Poses of the estimator ``linear`` only: ``continuous`` distorts its trajectory to fit the prisms. Poses that are
-        invalid for another reason than their residual are ignored.
+        Poses of the estimator ``linear`` only: ``continuous`` distorts its trajectory to fit the prisms, unless an IMU
+        prevents it. Poses that are invalid for another reason than their residual are ignored.
         """
         if record.residual_m is None or record.velocity_mps is None or record.reason not in ("", "residual"):
             return []
@@ -108,13 +109,15 @@ class LayoutMonitor(Observer):
             for station, residual_mm in sample.by_station_mm.items():
                 totals_mm[station] = totals_mm.get(station, 0.0) + residual_mm
         likeliest = max(totals_mm, key=lambda station: totals_mm[station], default=None)
-        blind = (
-            "; a movement across the plane of three prisms is not observable" if len(totals_mm) <= 3 else ""
-        )
-        message = (
-            f"{self._figures()}: a tripod or a prism has moved, most likely of station {likeliest}; "
-            f"check with tsgt calibrate check{blind}"
-        )
+        cause, blind = "a tripod or a prism has moved", ""
+        if len(totals_mm) == MIN_PRISMS:
+            blind = "; a movement across the plane of three prisms is not observable"
+        elif len(totals_mm) < MIN_PRISMS:  # poses with the IMU
+            cause, blind = (
+                "a tripod, a prism or the IMU has moved",
+                "; only what the IMU contradicts is observable",
+            )
+        message = f"{self._figures()}: {cause}, most likely of station {likeliest}; check with tsgt calibrate check{blind}"
         return EventRecord(stamp_ns=now_ns, event="layout_residual_high", message=message, station=likeliest)
 
     def _figures(self) -> str:

@@ -7,6 +7,7 @@ instants and gives the same lines bit for bit.
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from tsgt.estimation import LiveEstimator
@@ -112,6 +113,15 @@ class Publisher:
         """Publish the events of expired time-outs and a status record; ``realtime_ns`` is the machine's Unix clock."""
         now_ns = self._now_ns()
         self._put_all(self._detector.tick(now_ns, realtime_ns=realtime_ns))
+        state = self._estimator.imu_state()
+        if imu is not None and state is not None:
+            imu = replace(
+                imu,
+                use=state.use.word,
+                disagreement=state.disagreement,
+                gyro_bias_radps=state.gyro_bias_radps,
+                accelerometer_bias_mps2=state.accelerometer_bias_mps2,
+            )
         status = self._statistics.status(now_ns, link, imu)
         self.put(status)
         return status

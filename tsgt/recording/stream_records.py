@@ -14,6 +14,7 @@ from pydantic import Field
 
 import tsgt
 from tsgt.model import (
+    MIN_PRISMS,
     ROBOT_FRAME,
     WORLD_FRAME,
     ClockSample,
@@ -38,6 +39,10 @@ ImuUse = Literal["used", "starting", "silent", "disagrees"]
 CONTINUOUS_PROMISE = (
     "The sigmas that the pose states, of position at the reference point and of rotation, each in its least certain "
     "direction, are within the limits of its kind, and no measurement contradicts it."
+)
+FEW_PRISMS_PROMISE = (
+    " With {prisms} and the IMU, no distances between three prisms check the set-up: a moved tripod or prism is noticed as far "
+    "as the IMU contradicts it."
 )
 LINEAR_PROMISE = (
     "Every prism was measured before and after the pose within the outage limit, and their positions fit."
@@ -78,8 +83,12 @@ class ValidityLimits(FiniteNumbers):
         """Return the limits of the parameters in force."""
         limits = parameters.pipeline
         continuous = limits.estimator == "continuous"
+        promise = CONTINUOUS_PROMISE if continuous else LINEAR_PROMISE
+        prisms = len(parameters.prisms)
+        if prisms < MIN_PRISMS and parameters.imu is not None:
+            promise += FEW_PRISMS_PROMISE.format(prisms=f"{prisms} prism{'' if prisms == 1 else 's'}")
         return cls(
-            promise=CONTINUOUS_PROMISE if continuous else LINEAR_PROMISE,
+            promise=promise,
             reference_point=parameters.reference_point.name,
             position_sigma_m=limits.position_sigma_limit_m if continuous else None,
             rotation_sigma_rad=limits.rotation_sigma_limit_rad if continuous else None,
@@ -274,8 +283,8 @@ class ImuStatus(FiniteNumbers):
     fit. Against a counter it also contains the error of the nominal rate."""
     problem: str
     """What is wrong with the device, its program or its values, for people; empty when nothing is."""
-    in_use: bool | None = None
-    """Whether the newest pose rests on it; null where the estimator does not tell."""
+    use: ImuUseOrNone = None
+    """Whether poses rest on it now, as in a pose; null where the estimator does not tell."""
     disagreement: str = ""
     """Why the estimator does not believe its samples, which disagree with the prisms, for people; empty when it does."""
     gyro_bias_radps: PositionOrNone = None
@@ -289,8 +298,8 @@ class ImuStatus(FiniteNumbers):
         parts += [f"{self.gaps} gaps ({self.lost} samples lost)", f"{self.saturated} saturated"]
         if self.clock_skew_ppm is not None:
             parts.append(f"clock {self.clock_skew_ppm:+.1f} ppm")
-        if self.in_use is not None:
-            parts.append("in use" if self.in_use else "not in use")
+        if self.use is not None:
+            parts.append(self.use)
         if self.gyro_bias_radps is not None:
             x, y, z = map(math.degrees, self.gyro_bias_radps)
             parts.append(f"gyro bias {x:+.3f} {y:+.3f} {z:+.3f} deg/s")

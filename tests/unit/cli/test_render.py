@@ -97,11 +97,11 @@ def test_status_text_omits_unknown_values() -> None:
 
 def test_status_text_has_the_imu() -> None:
     """Last, with what is wrong in words."""
-    imu = replace(IMU_STATUS, in_use=False, disagreement="the gyro and the prisms disagree")
+    imu = replace(IMU_STATUS, use="disagrees", disagreement="the gyro and the prisms disagree")
     text = render("status", encode_line(replace(STATUS, imu=imu)))
     assert text is not None
     assert text.endswith(
-        "; IMU: 2000 samples, 199.9 Hz, 1 gaps (3 samples lost), 0 saturated, clock -12.5 ppm, not in use, "
+        "; IMU: 2000 samples, 199.9 Hz, 1 gaps (3 samples lost), 0 saturated, clock -12.5 ppm, disagrees, "
         "the gyro and the prisms disagree, last 0.04 s ago"
     )
 

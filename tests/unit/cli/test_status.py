@@ -107,7 +107,7 @@ def test_sound_imu_is_shown_with_its_biases() -> None:
     imu = dataclasses.replace(
         IMU_STATUS,
         saturated=2,
-        in_use=True,
+        use="used",
         gyro_bias_radps=(0.001, -0.002, 0.0005),
         accelerometer_bias_mps2=(0.012, -0.034, 0.05),
     )
@@ -133,8 +133,8 @@ def test_sound_imu_is_shown_with_its_biases() -> None:
         ({"age_s": None}, "NO SAMPLES YET", False),
         ({"age_s": 3.0}, "SILENT 3.0 s", False),
         ({"problem": "it repeats the same values"}, "it repeats the same values", False),
-        ({"disagreement": "gyro against prisms"}, "DISAGREES WITH THE PRISMS", False),
-        ({"in_use": False}, "NOT IN USE YET", True),
+        ({"use": "disagrees", "disagreement": "gyro against prisms"}, "DISAGREES WITH THE PRISMS", False),
+        ({"use": "starting"}, "NOT IN USE YET", True),
     ],
 )
 def test_problem_of_the_imu_is_shown(change: dict[str, object], word: str, *, sound: bool) -> None:

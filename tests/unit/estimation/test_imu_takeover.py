@@ -13,6 +13,7 @@ from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
 from tsgt.estimation import LiveEstimator
 from tsgt.estimation.imu_takeover import QUARANTINE_S, SILENCE_S, SOUND_S
+from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.trajectory import FixedLagSmoother
 from tsgt.model import ImuSamples, Measurement
 from tsgt.recording import PoseRecord, encode_line
@@ -33,6 +34,7 @@ class FakeInertialSmoother(FixedLagSmoother):
     def __init__(self, _imu: ImuParameters, prior: MotionPrior, **_: Any) -> None:
         super().__init__(prior)
         self.health: str | None = None
+        self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
         self.samples: list[InertialSamples] = []
         self.created.append(self)
 
@@ -135,11 +137,15 @@ def test_disagreement_starts_anew_and_waits(scene: Scene) -> None:
     arrived = arrivals(scene, 6.8)
     live = LiveEstimator(scene.parameters)
     poses: list[PoseRecord] = []
+    states: list[object] = []
     for each in arrived:
         if each.received_ns > START + 2 * SECOND and len(FakeInertialSmoother.created) == 1:
             FakeInertialSmoother.created[0].health = "its rates are not those of the prisms"
         found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
         poses += predicted(list(found))
+        states.append(live.imu_state())
+    assert states[-1] == (ImuUse.USED, "", (0.001, 0.002, -0.003), (0.01, -0.02, 0.03))
+    assert (ImuUse.DISAGREES, "its rates are not those of the prisms", None, None) in states
     _, _, (disagrees, from_s), (used, until_s) = uses_from(poses)
     assert (disagrees, used) == ("disagrees", "used")
     assert from_s == pytest.approx(2.0, abs=0.16)

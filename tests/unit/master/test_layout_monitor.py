@@ -65,6 +65,14 @@ def test_alarm_states_station_and_residual() -> None:
     assert event.stamp_ns == START + 349 * PERIOD_NS + 7
 
 
+def test_alarm_of_two_prisms_names_the_imu() -> None:
+    """Its trajectory is what the prisms miss."""
+    two = [dataclasses.replace(p, stations=p.stations[:2]) for p in (pose(n, 9.0) for n in range(300))]
+    (event,) = events(two)
+    assert "a tripod, a prism or the IMU has moved, most likely of station" in event.message
+    assert event.message.endswith("; only what the IMU contradicts is observable")
+
+
 def test_alarm_ends_below_the_hysteresis() -> None:
     """Between 0.8 and 1 times the limit nothing changes; below there is one event."""
     steps = [

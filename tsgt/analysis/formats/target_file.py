@@ -70,7 +70,11 @@ def read_target_file(path: Path) -> TargetFile:
             "holds no usable target of station 1, whose frame is the world; add them", path=path
         )
     if len(file.measurements) == 1:
-        raise InputFileError("holds targets of station 1 only; add those of the other stations", path=path)
+        raise InputFileError(
+            "holds targets of station 1 only; add those of the other stations, but a single station needs no "
+            "calibration: its frame is station1",
+            path=path,
+        )
     return file
 
 

@@ -113,6 +113,17 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Whether there is a trajectory."""
         return self._predictor is not None
 
+    @property
+    def biases(self) -> tuple[FloatArray, FloatArray | None] | None:
+        """Biases of gyro and accelerometer at the newest knot, (3,) in rad/s and m/s^2, in the axes of the IMU.
+
+        None without a trajectory; None for the accelerometer with the gyro alone.
+        """
+        if self._window is None or not self.initialised:
+            return None
+        knots = self._window.knots
+        return knots.gyro_bias[-1], None if self._gyro_only is not None else knots.bias_or_acceleration[-1]
+
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""
         if not len(new):

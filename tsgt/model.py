@@ -525,6 +525,13 @@ class ImuParameters(FiniteNumbers):
         if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < _ROTATION_TOLERANCE:
             raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
 
+    @property
+    def point(self) -> ReferencePoint:
+        """Its frame as a point of the robot whose pose may be exported."""
+        return ReferencePoint(
+            name=self.name, position_m=self.position_m, orientation_xyzw=self.orientation_xyzw
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuSamples:

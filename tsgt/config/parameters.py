@@ -27,8 +27,9 @@ from tsgt.model import (
 if TYPE_CHECKING:
     from tsgt.config.base import NoiseConfig
     from tsgt.config.master import MasterConfig
-    from tsgt.config.pipeline import PipelineConfig
+    from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
     from tsgt.config.scenario import ScenarioConfig, SimulatedStation
+    from tsgt.model import ImuParameters, ReferencePoint
 
 
 def parameters(config: MasterConfig) -> Parameters:
@@ -60,6 +61,8 @@ def parameters(config: MasterConfig) -> Parameters:
         None if config.imu is None or config.imu.mounting is None else load_imu_mounting(config.imu.mounting)
     )
     imu = None if config.imu is None else config.imu.parameters()
+    if imu is not None and mounting is not None:
+        imu = mounting.applied(imu)
     return Parameters(
         stations=tuple(
             calibration.stations[station.station].applied(
@@ -77,7 +80,7 @@ def parameters(config: MasterConfig) -> Parameters:
         ),
         prisms=tuple(PrismPosition(prism=prism, position_m=layout[prism]) for prism in tracked),
         pipeline=pipeline_parameters(config.pipeline),
-        reference_point=config.reference_point.point(),
+        reference_point=_reference_point(config.reference_point, imu),
         setup_covariance=setup_covariance(
             calibration.covariance,
             prism_layout.covariance,
@@ -85,8 +88,19 @@ def parameters(config: MasterConfig) -> Parameters:
             prism_numbers=tracked,
             imu=None if mounting is None else mounting.covariance,
         ),
-        imu=imu if imu is None or mounting is None else mounting.applied(imu),
+        imu=imu,
     )
+
+
+def _reference_point(config: ReferencePointConfig, imu: ImuParameters | None) -> ReferencePoint:
+    """Return the point; that of the IMU if it has its name and no place of its own."""
+    if (
+        imu is not None
+        and config.name == imu.name
+        and not {"position_m", "orientation_xyzw"} & config.model_fields_set
+    ):
+        return imu.point
+    return config.point()
 
 
 def _check_imu(config: MasterConfig, prisms: int) -> None:

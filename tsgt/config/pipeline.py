@@ -83,7 +83,8 @@ class ReferencePointConfig(Model):
     """Frame on the robot whose pose is streamed, recorded and exported: of a sensor, for example."""
 
     name: str = ROBOT_FRAME
-    """Name of the frame; the robot frame's own name unless another one is given."""
+    """Name of the frame; the robot frame's own name unless another one is given. That of the IMU (`imu.name`) without the next
+    keys: the IMU's own frame."""
     position_m: Place = (0.0, 0.0, 0.0)
     """Its origin in the robot frame, [x, y, z]."""
     orientation_xyzw: Row4 = (0.0, 0.0, 0.0, 1.0)

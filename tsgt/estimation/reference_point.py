@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from tsgt.estimation.pose_batch import PoseBatch
     from tsgt.geometry import FloatArray
-    from tsgt.model import ImuParameters, Parameters
+    from tsgt.model import Parameters
     from tsgt.recording import PoseRecord
 
 POINT_COMMENT = "# reference_point:"
@@ -69,16 +69,11 @@ def named_point(parameters: Parameters, name: str) -> ReferencePoint:
     """
     points = {ROBOT_FRAME: ROBOT_ORIGIN, "centroid": centroid_point(parameters)}
     if parameters.imu is not None:
-        points[parameters.imu.name] = imu_point(parameters.imu)
+        points[parameters.imu.name] = parameters.imu.point
     points.setdefault(parameters.reference_point.name, parameters.reference_point)
     if name not in points:
         raise ValueError(f"there is no point {name!r}; there are {', '.join(points)}")
     return points[name]
-
-
-def imu_point(imu: ImuParameters) -> ReferencePoint:
-    """Return the frame of the robot's IMU."""
-    return ReferencePoint(name=imu.name, position_m=imu.position_m, orientation_xyzw=imu.orientation_xyzw)
 
 
 def centroid_at_point(parameters: Parameters) -> FloatArray:

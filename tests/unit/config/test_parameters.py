@@ -138,6 +138,22 @@ def test_delays_are_below_the_lag() -> None:
         PipelineConfig(smoothed_delays_s=(0.5, 0.5))
 
 
+def test_reference_point_of_the_imu_is_its_frame(folder: Path) -> None:
+    """It needs the name alone."""
+    (folder / "imu.toml").write_text(
+        'kind = "imu_mounting"\nposition_m = [0.2, -0.1, 0.4]\norientation_xyzw = [0.0, 0.0, 0.6, 0.8]\n'
+        "latency_ms = 4.3\ngyro_matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\n"
+    )
+    path = folder / "master.example.toml"
+    before, _, after = path.read_text().partition("[reference_point]")
+    _, _, after = after.partition("\n[")
+    imu = '[imu]\ncommand = ["/bin/imu"]\nmounting = "imu.toml"\nlatitude_deg = 46.8\n'
+    path.write_text(f'{before}{imu}[reference_point]\nname = "imu"\n' + (f"[{after}" if after else ""))
+    point = parameters(load(path, MasterConfig)).reference_point
+    assert (point.name, point.position_m) == ("imu", (0.2, -0.1, 0.4))
+    assert point.orientation_xyzw == (0.0, 0.0, 0.6, 0.8)
+
+
 def test_untracked_prism_is_omitted(folder: Path) -> None:
     """Poses do not wait for a spare prism."""
     layout = folder / "prism_layout.example.toml"

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.diagnosis.finding import Finding
     from tsgt.analysis.diagnosis.held_out_finding import Part
     from tsgt.analysis.diagnosis.residual_patterns import ResidualPattern
-    from tsgt.analysis.evaluation import HeldOutErrors, InterPrismDistances
-    from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.evaluation import HeldOutErrors, InterPrismDistances, Predictor
     from tsgt.analysis.smoothing import MotionModel, SmoothedRecording
     from tsgt.model import Measurement, Parameters
 
@@ -58,7 +57,7 @@ def diagnose(
     motion: MotionModel,
     *,
     origin_ns: int,
-    held_out: Mapping[Estimator, HeldOutErrors] | None = None,
+    held_out: Mapping[Predictor, HeldOutErrors] | None = None,
     distances: InterPrismDistances | None = None,
 ) -> Diagnosis:
     """Diagnose a recording.
@@ -94,7 +93,7 @@ def diagnose_smoothed(
     parameters: Parameters,
     smoothed: SmoothedRecording,
     *,
-    held_out: Mapping[Estimator, HeldOutErrors] | None = None,
+    held_out: Mapping[Predictor, HeldOutErrors] | None = None,
     distances: InterPrismDistances | None = None,
 ) -> Diagnosis:
     """Diagnose a smoothed recording; see :func:`diagnose`."""

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.evaluation import HeldOutErrors
-    from tsgt.analysis.processing import Estimator
+    from tsgt.analysis.evaluation import HeldOutErrors, Predictor
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import Observations
 
@@ -38,7 +37,7 @@ class Part:
 
 
 def held_out_parts(
-    observations: Observations, held_out: Mapping[Estimator, HeldOutErrors], prisms: Sequence[int]
+    observations: Observations, held_out: Mapping[Predictor, HeldOutErrors], prisms: Sequence[int]
 ) -> list[Part]:
     """Ratios of all points that are not at gaps, and of near and far, standing and moving ones, and of each prism."""
     splits = folds(observations)

@@ -21,8 +21,10 @@ from tsgt.analysis.evaluation.error_series import (
     pose_components,
 )
 from tsgt.analysis.evaluation.held_out import (
+    PREDICTOR_NAMES,
     Fold,
     HeldOutErrors,
+    Predictor,
     cross_validate,
     folds,
     held_out_errors,
@@ -73,6 +75,7 @@ from tsgt.analysis.evaluation.streamed_poses import StreamedPoses, newest_age_s,
 
 __all__ = [
     "COMPONENTS",
+    "PREDICTOR_NAMES",
     "AgeBin",
     "Align",
     "AlignedErrorStatistics",
@@ -92,6 +95,7 @@ __all__ = [
     "PoseErrorDetails",
     "PoseErrorStatistics",
     "PoseErrors",
+    "Predictor",
     "Reference",
     "RelativeErrors",
     "ResidualStatistics",

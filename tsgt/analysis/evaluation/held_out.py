@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from tsgt.analysis.evaluation.normalised_prediction import near_loss, normalised_prediction_errors
 from tsgt.analysis.refinement import refine_recorded_setup
-from tsgt.analysis.smoothing import estimate_motion_model
+from tsgt.analysis.smoothing import MIN_PRISMS, estimate_motion_model, recorded_motion_model
+from tsgt.estimation import centroid_m, noise_scales
 from tsgt.geometry.batch import fit_trajectory, scale_noise
+from tsgt.geometry.inertial import fit_inertial_trajectory
 from tsgt.geometry.motion_calibration import Setup
 
 if TYPE_CHECKING:
@@ -24,12 +27,21 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.processing import Estimator
     from tsgt.analysis.refinement import Refine
     from tsgt.analysis.smoothing import MotionModel
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import InertialSamples, InertialTrajectory
     from tsgt.geometry.trajectory import Observations, Trajectory
     from tsgt.model import Parameters
+
+Predictor = Literal["linear", "continuous", "continuous_imu"]
+"""The estimators, and ``continuous`` with the robot's IMU."""
+
+PREDICTOR_NAMES: dict[Predictor, str] = {
+    "linear": "linear",
+    "continuous": "continuous",
+    "continuous_imu": "continuous, with IMU",
+}
 
 FOLDS = 5
 
@@ -149,7 +161,7 @@ def interpolation_errors(observations: Observations, fold: Fold) -> FloatArray:
     return error_m
 
 
-def trajectory_errors(trajectory: Trajectory, test: Observations) -> FloatArray:
+def trajectory_errors(trajectory: Trajectory | InertialTrajectory, test: Observations) -> FloatArray:
     """Return the distance in m between measured prism positions and those that a trajectory predicts."""
     states, _ = trajectory.at(test.time_s)
     lever_arms = test.layout[test.prism]
@@ -163,53 +175,78 @@ def held_out_errors(
     parameters: Parameters,
     *,
     refine: Refine = "auto",
+    imu: InertialSamples | None = None,
     on_progress: Callable[[float], None] | None = None,
-) -> dict[Estimator, HeldOutErrors]:
+) -> dict[Predictor, HeldOutErrors]:
     """Cross-validate both estimators on observations in the order of time, with the stated noise and the recorded set-up.
 
     The hyperparameters are estimated and the set-up is refined five times, each time without the test measurements of one
     number's folds of all prisms, so that no prediction depends on the measurement that it is compared with; the pipeline's
     bound the hyperparameters from below, and replace them if the measurements are too few. ``linear`` has the recorded
-    set-up. ``on_progress`` gets the completed fraction, 0 to 1. Raises GeometryError if no trajectory fits the training
+    set-up. ``imu``: samples on the time axis of the observations, used for a third entry; ``continuous`` is missing where the
+    measurements alone determine no trajectory. ``on_progress`` gets the completed fraction, 0 to 1. Raises GeometryError if no trajectory fits the training
     measurements.
     """
     report = on_progress or (lambda _: None)
     splits = folds(observations)
+    complete = len(np.unique(observations.prism)) >= MIN_PRISMS
     models = []
     for number in range(FOLDS if splits else 0):
         report(number / (2 * FOLDS))
         training = observations.select(training_rows(observations, number))
-        models.append(_training_model(training, parameters, refine))
-    done = 0
-    normalised = []
-    near = near_loss(observations.time_s, observations.station)
-
-    def smoothing_errors(fold: Fold) -> FloatArray:
-        nonlocal done
-        report(0.5 + 0.5 * done / len(splits))
-        done += 1
-        setup, motion = models[fold.number]
-        found = fit_trajectory(
-            setup.applied(observations.select(fold.training)),
-            prior=motion.prior,
-            occluded_prior=parameters.pipeline.motion,
-            noise_scale=motion.noise_scales,
-        )
-        test = setup.applied_in_place(observations.select(fold.test))
-        normalised.append(
-            normalised_prediction_errors(
-                found.trajectory, scale_noise(test, motion.noise_scales), near[fold.test]
+        models.append(
+            _training_model(training, parameters, refine)
+            if complete
+            else (
+                Setup.of(training),
+                recorded_motion_model(training, parameters.pipeline, noise_scales(parameters)),
             )
         )
-        return trajectory_errors(found.trajectory, test)
+    done = 0
+    normalised: dict[Predictor, list[FloatArray]] = {"continuous": [], "continuous_imu": []}
+    predictors: list[Predictor] = ["continuous"] if complete or imu is None else []
+    predictors += [] if imu is None else ["continuous_imu"]
+    near = near_loss(observations.time_s, observations.station)
 
-    result: dict[Estimator, HeldOutErrors] = {
-        "linear": cross_validate(splits, lambda fold: interpolation_errors(observations, fold)),
-        "continuous": cross_validate(splits, smoothing_errors),
+    def fitted(name: Predictor, fold: Fold) -> Trajectory | InertialTrajectory:
+        setup, motion = models[fold.number]
+        training = setup.applied(observations.select(fold.training))
+        if name == "continuous":
+            return fit_trajectory(
+                training,
+                prior=motion.prior,
+                occluded_prior=parameters.pipeline.motion,
+                noise_scale=motion.noise_scales,
+            ).trajectory
+        assert imu is not None  # noqa: S101 (only then it is among the predictors)
+        assert parameters.imu is not None  # noqa: S101 (there are samples of it)
+        return fit_inertial_trajectory(
+            scale_noise(training, motion.noise_scales),
+            imu,
+            parameters.imu,
+            reference_m=centroid_m(parameters),
+        ).trajectory
+
+    def smoothing_errors(name: Predictor, fold: Fold) -> FloatArray:
+        nonlocal done
+        report(0.5 + 0.5 * done / (len(splits) * len(predictors)))
+        done += 1
+        setup, motion = models[fold.number]
+        trajectory = fitted(name, fold)
+        test = setup.applied_in_place(observations.select(fold.test))
+        normalised[name].append(
+            normalised_prediction_errors(trajectory, scale_noise(test, motion.noise_scales), near[fold.test])
+        )
+        return trajectory_errors(trajectory, test)
+
+    result: dict[Predictor, HeldOutErrors] = {
+        "linear": cross_validate(splits, lambda fold: interpolation_errors(observations, fold))
     }
-    if splits:
-        rows = np.concatenate([fold.test for fold in splits])
-        result["continuous"] = replace(result["continuous"], normalised=np.concatenate(normalised), rows=rows)
+    for name in predictors:
+        result[name] = cross_validate(splits, partial(smoothing_errors, name))
+        if splits:
+            rows = np.concatenate([fold.test for fold in splits])
+            result[name] = replace(result[name], normalised=np.concatenate(normalised[name]), rows=rows)
     report(1.0)
     return result
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import InertialTrajectory
     from tsgt.geometry.trajectory import Observations, Trajectory
 
 GAP_S, NEAR_S = 0.9, 1.0
@@ -65,7 +66,7 @@ def near_loss(time_s: FloatArray, station: NDArray[np.intp]) -> NDArray[np.bool_
 
 
 def normalised_prediction_errors(
-    trajectory: Trajectory, test: Observations, near: NDArray[np.bool_] | None = None
+    trajectory: Trajectory | InertialTrajectory, test: Observations, near: NDArray[np.bool_] | None = None
 ) -> FloatArray:
     """Divide prediction errors by their sigma, (N, 3): along the line of sight, horizontally and vertically across it.
 
@@ -79,7 +80,9 @@ def normalised_prediction_errors(
     """
     states, covariance = trajectory.at(test.time_s)
     linearised = linearise(test, states, np.arange(len(test)))
-    jacobian = linearised.jacobian
+    jacobian = linearised.jacobian[
+        :, :, : covariance.shape[2]
+    ]  # At the times of the states, the pose alone matters
     expected = np.einsum("mij,mjk,mik->mi", jacobian, covariance, jacobian, optimize=True) + np.diagonal(
         linearised.covariance(test), axis1=1, axis2=2
     )

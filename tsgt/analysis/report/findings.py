@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         Outlier,
         PoseErrorDetails,
         PoseErrorStatistics,
+        Predictor,
         Reference,
         ResidualStatistics,
         StationaryStatistics,
@@ -123,7 +124,7 @@ class Findings:
     continuous: SmoothedRecording | None
     linear: PoseBatch | None = None
     difference: Difference | None = None
-    held_out: dict[Estimator, HeldOutErrors] | None = None
+    held_out: dict[Predictor, HeldOutErrors] | None = None
     residuals: dict[int, dict[str, ResidualStatistics]]
     outliers: list[Outlier]
     normalised: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
@@ -221,6 +222,7 @@ def collect_findings(
                 observations,
                 parameters,
                 refine=refine,
+                imu=None if continuous.imu is None else continuous.imu.samples,
                 on_progress=lambda s: report(fitted + 0.1 + 0.3 * s),
             ),
         )

@@ -50,5 +50,6 @@ def _key_figures(f: Findings) -> Iterator[tuple[str, str]]:
         )
         yield "error against the reference (rms), rotation", f"{details.ate.orientation_deg.rms:.2f} deg"
     if f.held_out is not None:
-        mean_mm = f.held_out[estimator].statistics.mean
+        with_imu = estimator == "continuous" and f.continuous is not None and f.continuous.imu is not None
+        mean_mm = f.held_out["continuous_imu" if with_imu else estimator].statistics.mean
         yield "mean error of predicting left-out measurements of prisms", f"{format_number(mean_mm)} mm"

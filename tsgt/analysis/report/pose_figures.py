@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.evaluation import PREDICTOR_NAMES
 from tsgt.analysis.figures import curve, dots, stroke
 
 if TYPE_CHECKING:
@@ -15,9 +16,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.analysis.design import Perturbation
-    from tsgt.analysis.evaluation import HeldOutErrors
+    from tsgt.analysis.evaluation import HeldOutErrors, Predictor
     from tsgt.analysis.figures import TimeAxis
-    from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.findings import Difference
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
@@ -59,7 +59,7 @@ def draw_map(figure: Figure, poses: PoseBatch, stations: Mapping[int, FloatArray
     figure.legend(loc="outside upper center", ncols=4)
 
 
-def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -> None:
+def draw_held_out(figure: Figure, held_out: Mapping[Predictor, HeldOutErrors]) -> None:
     """Draw the cumulative distribution of the held-out prediction errors of each estimator."""
     parts = [
         (gap, title)
@@ -73,7 +73,7 @@ def draw_held_out(figure: Figure, held_out: Mapping[Estimator, HeldOutErrors]) -
             chosen = np.sort(1e3 * each.error_m[each.at_gap == gap])
             share = 100 * np.arange(1, len(chosen) + 1) / max(1, len(chosen))
             look = stroke(row)
-            panel.plot(chosen, share, color=look.color, linestyle=look.linestyle, label=name)
+            panel.plot(chosen, share, color=look.color, linestyle=look.linestyle, label=PREDICTOR_NAMES[name])
             # The largest errors would compress all others.
             reach_mm = max(reach_mm, 1.2 * np.percentile(chosen, 97) if len(chosen) else 0.0)
         panel.set_xlim(0.0, reach_mm or 1.0)
@@ -137,7 +137,13 @@ def draw_perturbation(figure: Figure, study: Sequence[Perturbation], measured_m:
     for panel, values, names, label in panels:
         for row, name in enumerate(names):
             look = stroke(row)
-            panel.plot(noise_mm, values[:, row], color=look.color, linestyle=look.linestyle, label=name)
+            panel.plot(
+                noise_mm,
+                values[:, row],
+                color=look.color,
+                linestyle=look.linestyle,
+                label=name,
+            )
             panel.plot(
                 noise_mm[::5], values[::5, row], color=look.color, linestyle="none", marker=look.marker
             )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.analysis.evaluation import noise_scales_by_axis
+from tsgt.analysis.evaluation import PREDICTOR_NAMES, noise_scales_by_axis
 from tsgt.analysis.figures import panels_height_mm
 from tsgt.analysis.report import pose_figures as draw
 from tsgt.analysis.report.numbers import difference_numbers, perturbation_numbers, pose_numbers
@@ -44,7 +44,10 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         rows = [
             format_cells(label, (m.n, 0), (m.mean, 1), (m.median, 1), (m.p95, 1))
             for name, each in f.held_out.items()
-            for label, m in ((name, each.statistics), (f"{name}, at gaps over 1 s", each.gaps))
+            for label, m in (
+                (PREDICTOR_NAMES[name], each.statistics),
+                (f"{PREDICTOR_NAMES[name]}, at gaps over 1 s", each.gaps),
+            )
             if m.n
         ]
         header = ("estimator", "measurements", "mean", "median", "95 %")

@@ -10,6 +10,7 @@ import click
 
 from tsgt.analysis.diagnosis import diagnose_smoothed
 from tsgt.analysis.evaluation import (
+    PREDICTOR_NAMES,
     compare_live,
     held_out_errors,
     inter_prism,
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
         InterPrismDistances,
         Outlier,
         PairDistances,
+        Predictor,
     )
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.refinement import Refine
@@ -258,7 +260,7 @@ def evaluate(
 def _diagnosis(
     loaded: Recording,
     continuous: SmoothedRecording,
-    predicted: dict[Estimator, HeldOutErrors] | None,
+    predicted: dict[Predictor, HeldOutErrors] | None,
     distances: InterPrismDistances,
 ) -> Diagnosis | None:
     """Diagnose; None for too few measurements."""
@@ -271,19 +273,25 @@ def _diagnosis(
 
 def _held_out(
     loaded: Recording, continuous: SmoothedRecording, path: Path, refine: Refine
-) -> dict[Estimator, HeldOutErrors]:
+) -> dict[Predictor, HeldOutErrors]:
     # Not the observations of the fit: their noise scale was estimated from all measurements, held-out ones included.
     observations, _ = build_observations(
         loaded.parameters, continuous.sources, origin_ns=continuous.origin_ns
     )
     try:
         with progress("predicting held-out measurements") as on_progress:
-            return held_out_errors(observations, loaded.parameters, refine=refine, on_progress=on_progress)
+            return held_out_errors(
+                observations,
+                loaded.parameters,
+                refine=refine,
+                imu=None if continuous.imu is None else continuous.imu.samples,
+                on_progress=on_progress,
+            )
     except GeometryError as error:
         raise RecordingError(str(error), path=path) from error
 
 
-def _held_out_keys(predicted: dict[Estimator, HeldOutErrors]) -> dict[str, Any]:
+def _held_out_keys(predicted: dict[Predictor, HeldOutErrors]) -> dict[str, Any]:
     return {
         name: {**dataclasses.asdict(each.statistics), "gaps": dataclasses.asdict(each.gaps)}
         for name, each in predicted.items()
@@ -303,11 +311,14 @@ def _print_pairs(pairs: Sequence[PairDistances]) -> None:
     print_table(["pair", "n", "reference", "mean", "std", "mean |error|", "p95 |error|"], rows)
 
 
-def _print_held_out(predicted: dict[Estimator, HeldOutErrors]) -> None:
+def _print_held_out(predicted: dict[Predictor, HeldOutErrors]) -> None:
     rows = [
         [label, str(f.n), *numbers(f.mean, f.median, f.p95)]
         for name, each in predicted.items()
-        for label, f in ((name, each.statistics), (f"{name}, gaps over 1 s", each.gaps))
+        for label, f in (
+            (PREDICTOR_NAMES[name], each.statistics),
+            (f"{PREDICTOR_NAMES[name]}, gaps over 1 s", each.gaps),
+        )
     ]
     print_table(["estimator", "n", "mean", "median", "p95"], rows)
 

@@ -1,0 +1,92 @@
+"""``process``, ``evaluate`` and ``export`` with the robot's IMU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.imu_recording import IMU, imu_recording, shaken_drive, write
+from harness.records import HEADER
+
+from tsgt.analysis.formats import write_imu_mounting
+from tsgt.model import SetupCovariance
+from tsgt.recording import encode_line
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from harness.cli import Tsgt
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of two stations with an IMU, the same of a master without one, its samples and its set-up."""
+    path = tmp_path_factory.mktemp("imu")
+    recording = imu_recording(shaken_drive(22.0), stations=2)
+    write(path / "with.jsonl", recording)
+    without = replace(recording.parameters, imu=None)
+    write(path / "without.jsonl", replace(recording, parameters=without, imu_samples=[]))
+    lines = [encode_line(record) + b"\n" for record in (HEADER, *recording.imu_samples)]
+    (path / "samples.jsonl").write_bytes(b"".join(lines))
+    covariance = SetupCovariance(components=("imu.x",), matrix=((1e-6,),))
+    write_imu_mounting(path / "imu.toml", IMU, comment="by a test", covariance=covariance)
+    return path
+
+
+def positions(path: Path) -> np.ndarray:
+    """Return stamps and positions of a TUM file, (N, 4)."""
+    return np.loadtxt(path)[:, :4]
+
+
+def test_imported_samples_are_worth_the_recorded_ones(tsgt: Tsgt, folder: Path, tmp_path: Path) -> None:
+    """With the file of a calibration, which describes the IMU."""
+    done = tsgt("process", folder / "with.jsonl", "--output", tmp_path / "a.tum")
+    assert "IMU: used with stations 1, 2" in done.out
+    imported = ("--imu", folder / "samples.jsonl", "--imu-setup", folder / "imu.toml")
+    result = tsgt(
+        "process", folder / "without.jsonl", *imported, "--output", tmp_path / "b.tum", "--json"
+    ).json()
+    assert result["imu"]["stations"] == [1, 2]
+    np.testing.assert_allclose(positions(tmp_path / "b.tum"), positions(tmp_path / "a.tum"), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("recording", "options", "message"),
+    [
+        ("with", ("--no-imu",), "an IMU"),
+        ("without", (), "an IMU"),
+        ("without", ("--imu", "samples.jsonl"), "give --imu-setup"),
+        ("with", ("--no-imu", "--imu-setup", "imu.toml"), "exclude each other"),
+    ],
+)
+def test_two_stations_need_the_imu(
+    tsgt: Tsgt, folder: Path, tmp_path: Path, recording: str, options: tuple[str, ...], message: str
+) -> None:
+    """And both its samples and its parameters."""
+    given = [option if option.startswith("--") else folder / option for option in options]
+    done = tsgt("process", folder / f"{recording}.jsonl", *given, "--output", tmp_path / "a.tum")
+    assert done.code in (1, 2)
+    assert message in done.err
+
+
+def test_export_gives_poses_of_the_imu_by_its_name(tsgt: Tsgt, folder: Path, tmp_path: Path) -> None:
+    """The points of the robot have names."""
+    output = tmp_path / "imu.tum"
+    assert tsgt("export", folder / "with.jsonl", "--point", "imu", "--output", output).code == 0
+    robot = tmp_path / "robot.tum"
+    assert tsgt("process", folder / "with.jsonl", "--output", robot).code == 0
+    distances = np.linalg.norm(positions(output)[:, 1:] - positions(robot)[:, 1:], axis=1)
+    np.testing.assert_allclose(distances, np.linalg.norm(IMU.position_m), atol=1e-5)
+    done = tsgt("export", folder / "with.jsonl", "--point", "lidar", "--output", output)
+    assert done.code == 2
+    assert "there are robot, centroid, imu" in done.err
+
+
+@pytest.mark.slow
+def test_evaluate_predicts_held_out_measurements_with_the_imu(tsgt: Tsgt, folder: Path) -> None:
+    """Better than by interpolation; without the IMU two stations predict nothing else."""
+    found = tsgt("evaluate", folder / "with.jsonl", "--json").json()["held_out_mm"]
+    assert set(found) == {"linear", "continuous_imu"}
+    assert found["continuous_imu"]["mean"] < 0.5 * found["linear"]["mean"]

@@ -6,7 +6,7 @@ In: raw measurements and the parameters in force. Out: poses with covariance, va
 `reference_point` carries them to another point of the robot.
 """
 
-from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, check_recorded_setup
+from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, StartCheck, check_recorded_setup, start_now
 from tsgt.estimation.inertial import SampleConverter, inertial_samples
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
@@ -57,6 +57,7 @@ __all__ = [
     "PoseBatch",
     "Reason",
     "SampleConverter",
+    "StartCheck",
     "Track",
     "build_observations",
     "build_tracks",
@@ -78,6 +79,7 @@ __all__ = [
     "reference_point_text",
     "setup_jacobian",
     "sigma_limits_of",
+    "start_now",
     "stated_covariance",
     "transform_between",
     "transform_of",

@@ -30,6 +30,8 @@ from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from tsgt.estimation.imu_takeover import ImuState, TrajectoryWindow
@@ -47,11 +49,11 @@ _NONE = np.empty((0, _POSE_DIM, _POSE_DIM))
 class ContinuousEstimator:
     """The estimator ``continuous``, with the interface of :class:`~tsgt.estimation.linear.LinearEstimator`.
 
-    ``outside_lag_window``: by station, how many measurements arrived after the poses of their time had been smoothed.
+    ``untrusted``: says why the IMU must not be used, None if nothing is known. ``outside_lag_window``: by station, how many measurements arrived after the poses of their time had been smoothed.
     Raises DegenerateGeometryError if prisms of the layout coincide or, without an IMU, are fewer than three or collinear.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, untrusted: Callable[[], str | None] = lambda: None) -> None:
         self._parameters = parameters
         self._limits = parameters.pipeline
         self._columns = {prism.prism: column for column, prism in enumerate(parameters.prisms)}
@@ -64,7 +66,7 @@ class ContinuousEstimator:
         self._imu = (
             None
             if parameters.imu is None
-            else ImuTakeover(parameters.imu, self._without_imu, self._create_with_imu)
+            else ImuTakeover(parameters.imu, self._without_imu, self._create_with_imu, untrusted)
         )
         self._pending: list[Measurement] = []
         none = np.empty(0, np.int64)

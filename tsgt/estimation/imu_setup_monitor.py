@@ -8,6 +8,7 @@ result counts a fixed time after its start, so that a replay gives the same.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,13 +24,13 @@ from tsgt.geometry.inertial_calibration import SetupCheck, check_imu_setup
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
 
     from tsgt.geometry.inertial_calibration import Cause, SetupFinding
     from tsgt.model import ImuSamples, Measurement, Parameters
 
-    StartCheck = Callable[[Callable[[], SetupCheck]], Callable[[], SetupCheck]]
-    """Starts a computation, and returns what waits for its result."""
+StartCheck = Callable[[Callable[[], SetupCheck]], Callable[[], SetupCheck]]
+"""Starts a computation, and returns what waits for its result."""
 
 WINDOW_NS = 50_000_000_000
 FIRST_NS = 22_000_000_000  # Of measurements before the first check: two aligned drives have 20 s in common
@@ -76,7 +77,10 @@ def check_recorded_setup(
         return check_imu_setup(
             fit.observations, fit.trajectory.knots, samples, mounting, imu.noise, Gravity.of(imu)
         )
-    except GeometryError:  # Too few measurements or samples: there is nothing to compare
+    except (
+        GeometryError,
+        np.linalg.LinAlgError,
+    ):  # Too few measurements or samples: there is nothing to compare
         return SetupCheck()
 
 

@@ -1,7 +1,7 @@
 """Takes the trajectory with the IMU while that is sound, and the one without while it is not. Sans-I/O.
 
 Both are tracked all the time from the same measurements, the one without IMU twice a second while it is not needed. So when the
-IMU falls silent or disagrees, the next poses are those of an estimator that never had one.
+IMU falls silent, disagrees or turns out to be set up wrongly, the next poses are those of an estimator that never had one.
 """
 
 from __future__ import annotations
@@ -137,22 +137,28 @@ class ImuState(NamedTuple):
     accelerometer_bias_mps2: Vector3 | None
 
 
-_LOSSES = ImuUse.SILENT, ImuUse.DISAGREES
+_WRONG = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
 
 
 class ImuTakeover:
     """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
 
-    ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement. ``use``:
-    whether poses rest on the IMU, and why not.
+    ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement.
+    ``untrusted``: says why the IMU must not be used, None if nothing is known. ``use``: whether poses rest on the IMU, and
+    why not.
     """
 
     def __init__(
-        self, imu: ImuParameters, without: TrajectoryWindow, create_with: Callable[[], InertialWindow]
+        self,
+        imu: ImuParameters,
+        without: TrajectoryWindow,
+        create_with: Callable[[], InertialWindow],
+        untrusted: Callable[[], str | None] = lambda: None,
     ) -> None:
         self._imu = imu
         self._without = without
         self._create_with = create_with
+        self._untrusted = untrusted
         self._with = create_with()
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
@@ -170,7 +176,7 @@ class ImuTakeover:
         """Return what is known of the IMU now."""
         biases = self._with.biases if self._with.converged else None
         gyro, accelerometer = (None, None) if biases is None else biases
-        disagreement = self._disagreement if self.use == ImuUse.DISAGREES else ""
+        disagreement = self._disagreement if self.use in _WRONG else ""
         return ImuState(self.use, disagreement, _vector(gyro), _vector(accelerometer))
 
     @property
@@ -215,11 +221,12 @@ class ImuTakeover:
         """Choose the window for poses that are sent at a time."""
         self._now_s = now_s
         found = self._found(now_s)
-        if found == ImuUse.DISAGREES:
-            self._disagreement = str(getattr(self._with, "health", "") or "")
+        if found in _WRONG:
+            self._disagreement = self._untrusted() or str(getattr(self._with, "health", "") or "")
             self._with = self._create_with()
-        if found in _LOSSES:
-            self._sound_from_s = now_s + (QUARANTINE_S if found == ImuUse.DISAGREES else SOUND_S)
+            self._sound_from_s = now_s + QUARANTINE_S
+        elif found == ImuUse.SILENT:
+            self._sound_from_s = now_s + SOUND_S
         elif now_s < self._sound_from_s:
             found = self.use
         if found != ImuUse.USED:
@@ -236,6 +243,8 @@ class ImuTakeover:
         self._with.marginalise_before(before_s)
 
     def _found(self, now_s: float) -> ImuUse:
+        if self._untrusted() is not None:
+            return ImuUse.WRONG_SETUP
         if now_s - self._newest_s > SILENCE_S:
             return ImuUse.SILENT if np.isfinite(self._newest_s) else ImuUse.STARTING
         if getattr(self._with, "health", None) is not None:  # a window that judges its IMU

@@ -10,23 +10,31 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from tsgt.estimation.continuous import ContinuousEstimator
+from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, start_now
 from tsgt.estimation.linear import LinearEstimator
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
+    from tsgt.estimation.imu_setup_monitor import StartCheck
     from tsgt.estimation.imu_takeover import ImuState
     from tsgt.model import ImuSamples, Measurement, Parameters
-    from tsgt.recording import PoseRecord
+    from tsgt.recording import EventRecord, PoseRecord
 
 
 class LiveEstimator:
-    """Turns arriving measurements into records: each measurement, followed by the poses that it completes."""
+    """Turns arriving measurements into records: each measurement, followed by the poses that it completes.
 
-    def __init__(self, parameters: Parameters) -> None:
+    ``start_check``: how a check of the IMU's set-up is computed.
+    """
+
+    def __init__(self, parameters: Parameters, start_check: StartCheck = start_now) -> None:
         continuous = parameters.pipeline.estimator == "continuous"
         self._with_imu = continuous and parameters.imu is not None
-        self._estimator = ContinuousEstimator(parameters) if continuous else LinearEstimator(parameters)
+        self._setup = None if parameters.imu is None else ImuSetupMonitor(parameters, start_check)
+        self._estimator = (
+            ContinuousEstimator(parameters, self.imu_untrusted) if continuous else LinearEstimator(parameters)
+        )
         self._now_ns = -(2**63)
         self._begun = False
 
@@ -43,10 +51,14 @@ class LiveEstimator:
             self._begun = True
         due = self.advance(measurement.received_ns)
         self._estimator.add(measurement)
+        if self._setup is not None:
+            self._setup.measurement(measurement)
         return [*due, measurement, *self.advance(measurement.received_ns)]
 
     def imu_samples(self, samples: ImuSamples) -> list[ImuSamples | PoseRecord]:
         """Take samples of the IMU at their ``received_ns``, as :meth:`measurement`; return them after the poses due before."""
+        if self._setup is not None:
+            self._setup.samples(samples)
         if not self._with_imu:
             return [samples]
         if samples.received_ns < self._now_ns:
@@ -60,6 +72,14 @@ class LiveEstimator:
         """Return the poses that are due by now; call it before another record is published."""
         self._now_ns = max(self._now_ns, now_ns)
         return list(self._estimator.advance(self._now_ns).records())
+
+    def imu_setup_events(self) -> Sequence[EventRecord]:
+        """Return the events on the set-up of the IMU since the last call; a replay finds them in its recording."""
+        return () if self._setup is None else self._setup.take_events()
+
+    def imu_untrusted(self) -> str | None:
+        """Return what is wrong in the set-up of the IMU; None if nothing is known to be."""
+        return None if self._setup is None else self._setup.untrusted
 
     def outside_lag_window(self) -> Mapping[int, int] | None:
         """Return by station how many measurements arrived outside the lag window; None with ``linear``."""

@@ -60,6 +60,7 @@ class ImuUse(IntEnum):
     STARTING = 2
     SILENT = 3
     DISAGREES = 4
+    WRONG_SETUP = 5
 
     @property
     def word(self) -> stream_records.ImuUse | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NoReturn, Protocol
@@ -100,7 +101,10 @@ async def run_master(
         queue_lines=config.stream.queue_lines,
         unix_now_ns=lambda: timeline.unix_ns(clock.monotonic_ns()),
     )
-    with RecordingWriter(path, write=dependencies.write) as writer:
+    with (
+        ThreadPoolExecutor(1, "imu_setup_check") as checks,
+        RecordingWriter(path, write=dependencies.write) as writer,
+    ):
         recorder = Recorder(writer)
         recording = RecordingThread(recorder)
         header = RecordingHeader(
@@ -131,6 +135,7 @@ async def run_master(
                     ],
                     emit,
                     lambda: timeline.unix_ns(clock.monotonic_ns()),
+                    lambda work: checks.submit(work).result,
                 )
                 link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)
                 imu = _imu(config, timeline, publisher, dependencies)

@@ -22,6 +22,7 @@ _CAUSES = {
     "starting": "its trajectory is not certain enough",
     "silent": "there is no sample",
     "disagrees": "it disagrees with the measurements of the prisms",
+    "wrong_setup": "its set-up is wrong",
 }
 
 

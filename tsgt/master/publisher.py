@@ -10,7 +10,7 @@ import asyncio
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from tsgt.estimation import LiveEstimator
+from tsgt.estimation import LiveEstimator, start_now
 from tsgt.master import link_events
 from tsgt.model import PolarMeasurement
 from tsgt.recording import EventRecord, PoseRecord, encode_line
@@ -18,6 +18,7 @@ from tsgt.recording import EventRecord, PoseRecord, encode_line
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from tsgt.estimation import StartCheck
     from tsgt.master.station_events import StationEventDetector
     from tsgt.master.statistics import Statistics
     from tsgt.model import ImuSamples, Measurement, Parameters
@@ -55,6 +56,8 @@ class Publisher:
         Takes each record with its encoded line.
     now_ns
         Returns the present on the master's Unix clock.
+    start_check
+        How a check of the IMU's set-up is computed.
     """
 
     def __init__(
@@ -65,8 +68,9 @@ class Publisher:
         observers: Sequence[Observer],
         emit: Callable[[object, bytes], None],
         now_ns: Callable[[], int],
+        start_check: StartCheck = start_now,
     ) -> None:
-        self._estimator = LiveEstimator(parameters)
+        self._estimator = LiveEstimator(parameters, start_check)
         self._statistics = statistics
         self._detector = detector
         self._observers = observers
@@ -129,6 +133,7 @@ class Publisher:
     def measurement(self, measurement: Measurement) -> None:
         """Publish a measurement and the poses that it completes."""
         self._send(self._estimator.measurement(measurement), measurement.received_ns)
+        self._put_all(self._estimator.imu_setup_events())
 
     def imu_samples(self, samples: ImuSamples) -> None:
         """Record samples of the IMU, in the order of arrival among all other lines, after the poses due before them."""

@@ -34,7 +34,7 @@ Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]
 Quality = Literal["good", "degraded", "invalid"]
 Degradation = Literal["prism_missing", "old_measurements", "uncertain", "ambiguous", "residual"]
-ImuUse = Literal["used", "starting", "silent", "disagrees"]
+ImuUse = Literal["used", "starting", "silent", "disagrees", "wrong_setup"]
 
 CONTINUOUS_PROMISE = (
     "The sigmas that the pose states, of position at the reference point and of rotation, each in its least certain "
@@ -176,7 +176,8 @@ class PoseRecord(FiniteNumbers):
     epoch it has no numbers, because it would be a prediction."""
     imu: ImuUseOrNone = None
     """Whether the pose rests on the robot's IMU: ``used``; ``starting``: not yet, or not again, since its trajectory is not
-    certain enough; ``silent``: no sample for 0.3 s; ``disagrees``: with the measurements of the prisms. Poses without it
+    certain enough; ``silent``: no sample for 0.3 s; ``disagrees``: with the measurements of the prisms;
+    ``wrong_setup``: a drive has shown that its mounting, latency, axes or units are wrong. Poses without it
     are those of an estimator without IMU. The key is missing where no IMU is configured."""
     jump_m: float | None = None
     """Of a predicted pose with an IMU configured that is the first after measurements were added, or after the use of the

@@ -11,9 +11,10 @@ import pytest
 from harness.records import IMU_PARAMETERS, imu_samples
 from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
-from tsgt.estimation import LiveEstimator
+from tsgt.estimation import LiveEstimator, imu_setup_monitor
 from tsgt.estimation.imu_takeover import QUARANTINE_S, SILENCE_S, SOUND_S
 from tsgt.estimation.pose_batch import ImuUse
+from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.geometry.trajectory import FixedLagSmoother
 from tsgt.model import ImuSamples, Measurement
 from tsgt.recording import PoseRecord, encode_line
@@ -151,6 +152,24 @@ def test_disagreement_starts_anew_and_waits(scene: Scene) -> None:
     assert from_s == pytest.approx(2.0, abs=0.16)
     assert until_s == pytest.approx(from_s + QUARANTINE_S, abs=0.11)
     assert len(FakeInertialSmoother.created) == 2
+
+
+def test_wrong_setup_is_left_out_from_its_event_on(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses do not rest on an IMU that a drive has shown to be set up wrongly."""
+    monkeypatch.setattr(imu_setup_monitor, "FIRST_NS", SECOND)
+    monkeypatch.setattr(imu_setup_monitor, "RESULT_NS", SECOND)
+    wrong = SetupCheck((SetupFinding("rotation", 0.02, 0.001, "the mounting is wrong"),))
+    live = LiveEstimator(scene.parameters, lambda _work: lambda: wrong)
+    poses: list[PoseRecord] = []
+    for each in arrivals(scene, 4.0):
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    (event,) = live.imu_setup_events()
+    assert event.event == "imu_setup_wrong"
+    assert live.imu_untrusted() == "the mounting is wrong"
+    _, _, (use, from_s) = uses_from(poses)
+    assert use == "wrong_setup"
+    assert from_s == pytest.approx((event.stamp_ns - START) / SECOND, abs=0.11)
 
 
 def test_first_pose_after_a_measurement_states_its_jump(scene: Scene) -> None:

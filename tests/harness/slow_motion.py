@@ -42,8 +42,12 @@ def measure_along(
     vibration_m: float = 0.0,
     stations: Sequence[int] = (0, 1, 2),
     rate_hz: float = 2.5,
+    noise_scale: float = 1.0,
 ) -> Observations:
-    """Measure a robot that moves along the line of sight; each prism by its own one of the stations, at exact times."""
+    """Measure a robot that moves along the line of sight; each prism by its own one of the stations, at exact times.
+
+    ``noise_scale``: factor of the noise over the stated one.
+    """
     rng = np.random.default_rng(seed)
     count = int(until_s * rate_hz)
     time_s = (np.arange(count)[:, None] / rate_hz + rng.uniform(0, 1 / rate_hz, 3)).ravel()
@@ -58,7 +62,9 @@ def measure_along(
     return Observations(
         time_s=time_s,
         time_sigma_s=np.full(len(time_s), 1e-5),
-        points_m=add_polar_noise(transform_points(invert(FRAMES)[prism], world), SIGMAS_M, rng),
+        points_m=add_polar_noise(
+            transform_points(invert(FRAMES)[prism], world), noise_scale * np.asarray(SIGMAS_M), rng
+        ),
         sigmas_m=np.tile(SIGMAS_M, (len(time_s), 1)),
         polar=np.ones(len(time_s), dtype=bool),
         station=prism,

@@ -72,8 +72,13 @@ class AverageInformation:
         return np.asarray(moved).reshape(-1, STATE_DIM)
 
 
-def measurement_variates(solution: Solution, observations: Observations) -> Variates:
-    """Variates of the logarithms of 3 S factors on the noise, by station and component, and of one on all time sigmas."""
+def measurement_variates(
+    solution: Solution, observations: Observations, scaled: NDArray[np.bool_]
+) -> Variates:
+    """Variates of the logarithms of 3 S factors on the noise, by station and component, and of one on all time sigmas.
+
+    ``scaled``: (M,) measurements to whose noise the factors apply.
+    """
     linearised, weights = solution.linearised, solution.weights
     information = np.asarray(np.linalg.inv(linearised.covariance(observations)), np.float64)
     normalised = matvec(information, linearised.residuals_m)
@@ -81,7 +86,7 @@ def measurement_variates(solution: Solution, observations: Observations) -> Vari
     # (M, 3, 4) derivatives of the covariance times the normalised residuals: by the three components, and by the time
     derived = np.zeros((len(observations), 3, 4))
     components = np.arange(3)
-    derived[:, components, components] = 2.0 * observations.sigmas_m**2 * normalised
+    derived[:, components, components] = 2.0 * scaled[:, None] * observations.sigmas_m**2 * normalised
     derived[:, :, 3] = 2.0 * by_time * (by_time * normalised).sum(axis=1)[:, None]
     weighted = weights[:, None, None] * (information @ derived)
     inner = np.swapaxes(derived, 1, 2) @ weighted

@@ -21,17 +21,18 @@ from tsgt.geometry.batch.average_information import (
 )
 from tsgt.geometry.batch.evidence_search import Curved, maximise
 from tsgt.geometry.batch.noise_scales import (
+    MIN_SCALE,
     SCALE_SPREAD,
     log_scale_gradient,
+    min_scales,
     overall_scale,
-    scale_noise,
 )
 from tsgt.geometry.batch.process_moments import (
     ProcessMoments,
     expected_moments,
     expected_squared_distances,
 )
-from tsgt.geometry.batch.rest import rest_factors, steps_in_rest
+from tsgt.geometry.batch.rest import in_rest, rest_factors, steps_in_rest, with_vibration
 from tsgt.geometry.batch.rest_detection import find_rest
 from tsgt.geometry.trajectory.gauss_newton import (
     LOOSE_GAIN_TOLERANCE,
@@ -69,9 +70,8 @@ _SCALE_PARAMETERS = slice(6, -1)  # Factors on the noise by station and componen
 _LOWER = np.log([3e-3, 3e-3, 0.03, 3e-3, 3e-3, 0.03])
 _MIN_SIGMA = 3e-3
 _UPPER = np.log([30.0, 30.0, 10.0, 30.0, 30.0, 10.0])
-# A prior of white acceleration follows every measurement if it may, and then there seems to be no noise. No instrument is
-# better than half its data sheet.
-_SCALE_LIMITS = np.log([0.5, 30.0])
+# A prior of white acceleration follows every measurement if it may, and then there seems to be no noise.
+_SCALE_LIMITS = np.log([MIN_SCALE, 30.0])
 _ADAPTED_ITERATIONS = 2  # The next adaptation need not wait for convergence
 _TIME_SCALE_LIMITS = np.log([0.05, 1.0])
 _MEDIAN_SQUARED_DISTANCE = 2.37  # Of the chi-square distribution with 3 degrees of freedom
@@ -97,6 +97,7 @@ class _Segment:
         self.observations, self.knots = _without_blunders(observations)
         self.rest = find_rest(observations)
         self.moving = ~steps_in_rest(self.rest, self.knots.time_s)
+        self.measured_moving = in_rest(self.rest, self.observations.time_s) < 0
         self.local = np.ones((len(self.moving), 6))  # Factors on the variance of the accelerations
         self.log_evidence = -np.inf
         self.at: tuple[FloatArray, AverageInformation] | None = None  # Parameters of the trajectory
@@ -106,10 +107,19 @@ class _Segment:
         moving = axis_sigmas(prior) * np.sqrt(self.local)
         return rest_factors(self.rest, self.knots.time_s, moving, self.observations.layout)
 
+    def with_noise(self, parameters: FloatArray) -> Observations:
+        """Return the measurements with the noise of given parameters; at rest with their own."""
+        stated = self.observations
+        _, scales = _from_log_parameters(parameters)
+        factors = np.where(self.measured_moving[:, None], scales[stated.station], 1.0)
+        time_sigma_s = stated.time_sigma_s * float(np.exp(parameters[-1]))
+        scaled = replace(stated, sigmas_m=stated.sigmas_m * factors, time_sigma_s=time_sigma_s)
+        return with_vibration(scaled, self.rest, stated.sigmas_m)
+
     def adapt(self, parameters: FloatArray) -> None:
         """Let the process noise follow the motion, with given parameters."""
         prior, _ = _from_log_parameters(parameters)
-        observations = _with_noise(self.observations, parameters)
+        observations = self.with_noise(parameters)
         self.local = np.ones_like(self.local)
         initial, rest = self.factors(prior)
         sigmas = initial
@@ -197,6 +207,11 @@ def maximise_evidence(
     With ``local`` the process noise varies along the drive, and the evidence is that with its estimate.
     """
     segments = _segments(observations)
+    least = np.full_like(lower, -np.inf)
+    rest = [interval for segment in segments for interval in segment.rest]
+    least[_SCALE_PARAMETERS] = np.log(min_scales(observations, rest)).ravel()
+    lower = np.where(lower < upper, np.clip(least, lower, upper), lower)
+    start = np.clip(start, lower, upper)
     evaluations = 0
 
     def evidence(parameters: FloatArray) -> Curved:
@@ -288,12 +303,6 @@ def _from_log_parameters(parameters: FloatArray) -> tuple[MotionPrior, FloatArra
     return prior_from_axes(list(values[_SIGMA_PARAMETERS]), list(values[list(_TIME_PARAMETERS)])), scales
 
 
-def _with_noise(observations: Observations, parameters: FloatArray) -> Observations:
-    _, scales = _from_log_parameters(parameters)
-    time_sigma_s = observations.time_sigma_s * float(np.exp(parameters[-1]))
-    return replace(scale_noise(observations, scales), time_sigma_s=time_sigma_s)
-
-
 def _log_hyperprior(parameters: FloatArray) -> Curved:
     """Log density of the factors' deviations from the most probable common one, their mean."""
     factors = parameters[_SCALE_PARAMETERS]
@@ -309,7 +318,7 @@ def _log_hyperprior(parameters: FloatArray) -> Curved:
 def _evidence(segment: _Segment, parameters: FloatArray) -> Curved:
     """Log evidence of one segment by the log parameters."""
     prior, _ = _from_log_parameters(parameters)
-    observations = _with_noise(segment.observations, parameters)
+    observations = segment.with_noise(parameters)
     step_sigmas, rest = segment.factors(prior)
     guess = segment.guess(parameters)
     solution = solve(
@@ -326,7 +335,7 @@ def _evidence(segment: _Segment, parameters: FloatArray) -> Curved:
     segment.record(solution.knots, value, parameters, information)
     covariance, cross_covariance = solution.factor.marginals()
     gradient = np.zeros(len(parameters))
-    by_scale, gradient[-1] = log_scale_gradient(solution, observations, covariance)
+    by_scale, gradient[-1] = log_scale_gradient(solution, observations, covariance, segment.measured_moving)
     gradient[_SCALE_PARAMETERS] = by_scale.ravel()
     moments = expected_moments(solution, covariance, cross_covariance)
     sigmas, dt_s = axis_sigmas(prior), np.diff(solution.knots.time_s)
@@ -367,7 +376,7 @@ def _average_information(
         sigma_of_axis=sigma_of_axis.tolist(),
         scaled=segment.moving,
     )
-    noise = measurement_variates(solution, observations)
+    noise = measurement_variates(solution, observations, segment.measured_moving)
     mixing = np.zeros((len(process.products) + len(noise.products), len(parameters)))
     count = len(process.products)
     mixing[np.arange(count), [*sigma_parameters, *_TIME_PARAMETERS]] = 1.0

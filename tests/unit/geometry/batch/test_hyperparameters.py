@@ -14,6 +14,7 @@ from tsgt.errors import GeometryError
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.batch import fit_trajectory, hyperparameters, scale_noise, tune, with_noise_floor
 from tsgt.geometry.batch.hyperparameters import MIN_MEASUREMENTS, partially_occluded
+from tsgt.geometry.batch.rest import in_rest
 from tsgt.geometry.batch.rest_detection import find_rest
 from tsgt.geometry.trajectory import States
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
@@ -177,6 +178,21 @@ def test_stop_does_not_lower_the_process_noise() -> None:
     assert find_rest(whole)[-1].end_s > 85.0
     shorter, longer = (tune(each, noise_scale=1.0).prior for each in (drive, whole))
     np.testing.assert_allclose(axis_sigmas(longer)[:2], axis_sigmas(shorter)[:2], rtol=0.15)
+
+
+def test_quiet_measurements_at_rest_do_not_lower_the_noise() -> None:
+    """An instrument that is five times better at rest than on the move has the noise of the move."""
+
+    def start_and_stop(time_s: FloatArray) -> FloatArray:
+        return 2.0 * np.sin(0.4 * np.minimum(time_s, 10 * np.pi)) ** 4
+
+    observations = measure_along(start_and_stop, until_s=60.0, seed=13)
+    quiet = measure_along(start_and_stop, until_s=60.0, seed=13, noise_scale=0.2)
+    at_rest = in_rest(find_rest(observations), observations.time_s) >= 0
+    assert 0.4 < at_rest.mean() < 0.6
+    points_m = np.where(at_rest[:, None], quiet.points_m, observations.points_m)
+    found = tune(replace(observations, points_m=points_m))
+    assert found.noise_scale == pytest.approx(1.0, rel=0.15)
 
 
 def test_tuning_recovers_the_prior(observations: Observations) -> None:

@@ -13,7 +13,7 @@ from tsgt.estimation import build_observations, centroid_m, inertial_samples
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.geometry.inertial import Gravity
 from tsgt.geometry.inertial_calibration import ImuCalibration, calibrate_imu, robot_covariance
-from tsgt.model import SetupCovariance
+from tsgt.model import MIN_PRISMS, SetupCovariance
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -92,6 +92,12 @@ def calibrate_recorded_imu(
     if not len(samples):
         raise GeometryError("the recording has no samples of the IMU")
     observations, _ = build_observations(recording.parameters, recording.measurements, origin_ns=origin_ns)
+    prisms = len(np.unique(observations.prism))
+    if prisms < MIN_PRISMS:
+        raise GeometryError(
+            f"{prisms} of the {MIN_PRISMS} prisms that show how the robot turns were measured: calibrate once with "
+            f"{MIN_PRISMS} stations; the mounting stays valid with fewer, while IMU and prisms stay on the robot"
+        )
     found = calibrate_imu(
         observations, samples, configured.noise, Gravity.of(configured), on_progress=on_progress
     )

@@ -12,6 +12,7 @@ import numpy as np
 from tsgt.analysis.diagnosis import GEOMETRY, TARGETS
 from tsgt.analysis.report.findings import position_sigma_mm
 from tsgt.estimation import Kind, point_label
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -77,7 +78,11 @@ def _diagnosis(f: Findings) -> Iterator[Verdict]:
 
 
 def _poses(f: Findings) -> Iterator[Verdict]:
-    failed = [name for name in ("continuous", "linear") if name in f.problems]
+    # One or two prisms, with an IMU, have no poses by linear.
+    few = f.continuous is not None and len(f.recording.parameters.prisms) < MIN_PRISMS
+    failed = [
+        name for name in ("continuous", "linear") if name in f.problems and not (few and name == "linear")
+    ]
     for why in dict.fromkeys(f.problems[name] for name in failed):
         names = " and ".join(name for name in failed if f.problems[name] == why)
         yield Verdict(Level.BAD, f"No poses by {names}: {why}.")

@@ -116,3 +116,13 @@ def test_recording_without_imu(recording: Path) -> None:
     without = replace(loaded, parameters=replace(loaded.parameters, imu=None))
     with pytest.raises(GeometryError, match="the recording has no IMU"):
         calibrate_recorded_imu(without, read_imu_samples(recording))
+
+
+def test_two_prisms_do_not_calibrate(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """The message says what does."""
+    path = tmp_path / "two.jsonl"
+    lines = recording.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(line for line in lines if b'"point","station":3' not in line))
+    done = tsgt("calibrate", "imu", path)
+    assert done.code == 1
+    assert "2 of the 3 prisms that show how the robot turns were measured: calibrate once with 3" in done.err

@@ -94,7 +94,10 @@ class ContinuousEstimator:
     def _create_with_imu(self) -> InertialFixedLagSmoother:
         assert self._parameters.imu is not None  # noqa: S101 (only called with one)
         return InertialFixedLagSmoother(
-            self._parameters.imu, self._limits.motion, reference_m=centroid_m(self._parameters)
+            self._parameters.imu,
+            self._limits.motion,
+            reference_m=centroid_m(self._parameters),
+            setup_jacobian=setup_jacobian(self._parameters),
         )
 
     def begin_at(self, now_ns: int) -> None:

@@ -9,7 +9,7 @@ no pose: docs/explanation/imu.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,11 +21,13 @@ from tsgt.geometry.inertial.factors import (
     InertialFactors,
     assemble_inertial,
 )
+from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
+from tsgt.geometry.inertial.sensitivity import InertialSensitivity, Linearised
 from tsgt.geometry.inertial.smoother import estimation_noise
 from tsgt.geometry.inertial.solver import (
     MAX_BIAS_ROTATION_RAD,
@@ -46,6 +48,7 @@ from tsgt.geometry.trajectory.gauss_newton import (
     add_measurements,
     nearest_knots,
 )
+from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
     MAX_STEPS,
@@ -65,6 +68,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
+    from tsgt.geometry.trajectory.sensitivity import SetupJacobian
     from tsgt.model import ImuParameters, MotionPrior
 
 SEARCH_S = 40.0  # Longest stretch of measurements that the search over headings takes
@@ -73,6 +77,10 @@ SEARCH_GROWTH = (
 )
 MIN_SEARCH_STEP_S = 0.5
 MIN_PATH_M = 0.3  # Of a single prism: without motion it does not tell the heading
+CONSISTENT_ALONE = 5
+"""Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
+each of them. A chance agreement of wrong ones within the gate, five times, is none.
+"""
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
 SAMPLES_MARGIN_S = 0.5  # Before the oldest knot: the sample before a knot tells where the next one begins
 
@@ -91,18 +99,30 @@ class InertialFixedLagSmoother(MeasurementWindow):
     """
 
     def __init__(
-        self, imu: ImuParameters, prior: MotionPrior, *, reference_m: FloatArray, gyro_only: bool = False
+        self,
+        imu: ImuParameters,
+        prior: MotionPrior,
+        *,
+        reference_m: FloatArray,
+        setup_jacobian: SetupJacobian | None = None,
+        gyro_only: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(InnovationMonitor(CONSISTENT_ALONE))
         self._noise = estimation_noise(imu.noise)
         mounting = Mounting.of(imu, reference_m)
         self._mounting = replace(mounting, position=np.zeros(3)) if gyro_only else mounting
         self._prior, self._gyro_only = prior, prior if gyro_only else None
         self._initial_gravity = self._gravity = Gravity.of(imu)
+        self._health = HealthMonitor()
         self._samples: InertialSamples | None = None
         self._stale_from_s = np.inf  # Samples after this have arrived since the integration
         self._window: _Window | None = None
-        self._factor: BorderedCholesky | None = None
+        self._solved: _Solved | None = None
+        self._sensitivity: InertialSensitivity | None = None
+        if setup_jacobian is not None:
+            self._sensitivity = InertialSensitivity(setup_jacobian, self._mounting, gyro_only=gyro_only)
+        self._anchor_displacement: FloatArray | None = None
+        self._displacement: tuple[FloatArray, FloatArray] | None = None
         self._trajectory: WindowTrajectory | None = None
         self._predictor: StrapdownPredictor | None = None
         self._searched: Observations | None = None  # Also those before the horizon, while there is no start
@@ -124,21 +144,37 @@ class InertialFixedLagSmoother(MeasurementWindow):
         knots = self._window.knots
         return knots.gyro_bias[-1], None if self._gyro_only is not None else knots.bias_or_acceleration[-1]
 
+    @property
+    def health(self) -> str | None:
+        """Why the IMU is not to be believed now, for people; None: it is.
+
+        A reason is given while values are stuck, beyond any range, or at the limit of an axis; where the newest sample
+        is older than 0.4 s at the time of a prediction; and when two prisms disagree with the samples within 1.2 s (one, three times
+        in succession, where none other is measured). Stuck values and values beyond any range are left out. When prisms
+        disagree, the trajectory is started anew from what comes after. Save for old samples, the reason stays for 2 s after its last cause; then, and
+        once there is a trajectory again, the IMU is to be believed. :class:`~tsgt.geometry.inertial.health.HealthMonitor` gives the
+        grounds of the thresholds.
+        """
+        return self._health.reason
+
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""
         if not len(new):
             return
-        held, self._samples = self._samples, new
-        if held is not None and len(held):
-            self._samples = concatenate_samples([held, new])
-            if new.end_s[0] <= held.end_s[-1]:
-                order = np.argsort(self._samples.end_s, kind="stable")
-                ends_s = self._samples.end_s[order]
+        new = new.select(self._health.samples(new))
+        held, stuck_s = self._samples, self._health.stuck_from_s
+        parts = [each.select(each.end_s <= stuck_s) for each in (held, new) if each is not None]
+        joined = concatenate_samples(parts)
+        from_s = stuck_s
+        if len(new):
+            if held is not None and len(held) and new.end_s[0] <= held.end_s[-1]:
+                order = np.argsort(joined.end_s, kind="stable")
                 # The first of two of the same interval.
-                self._samples = self._samples.select(order[np.diff(ends_s, prepend=-np.inf) > 0])
-        # The gap before the first of them ends there.
-        previous = int(np.searchsorted(self._samples.end_s, new.end_s[0])) - 1
-        from_s = float(self._samples.end_s[previous]) if previous >= 0 else -np.inf
+                joined = joined.select(order[np.diff(joined.end_s[order], prepend=-np.inf) > 0])
+            # The gap before the first of them ends there.
+            previous = int(np.searchsorted(joined.end_s, new.end_s[0])) - 1
+            from_s = min(from_s, float(joined.end_s[previous]) if previous >= 0 else -np.inf)
+        self._samples = joined
         self._stale_from_s = min(self._stale_from_s, from_s)
         if self._predictor is not None:
             self._predictor.discard_after(from_s)
@@ -168,6 +204,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         scales the covariance.
         """
         assert self._predictor is not None  # noqa: S101 (only called while initialised)
+        self._health.advance(time_s)
         if time_s >= self._predictor.time_s:
             return self._predict(time_s, dim)
         return self.trajectory().at(np.array([time_s]), dim=dim)
@@ -181,27 +218,52 @@ class InertialFixedLagSmoother(MeasurementWindow):
     def trajectory(self) -> WindowTrajectory:
         """Return the trajectory over the window and over what the last :meth:`marginalise_before` eliminated."""
         if self._trajectory is None:
-            assert self._window is not None  # noqa: S101 (only called while initialised)
-            assert self._factor is not None  # noqa: S101 (likewise)
+            assert self._solved is not None  # noqa: S101 (only called while initialised)
+            window, gravity, factor, _ = self._solved
+            displacement = self._window_displacement()
             self._trajectory = WindowTrajectory(
                 InertialTrajectory(
-                    self._window.knots,
-                    self._gravity,
-                    self._contiguous(self._window.knots.time_s),
+                    window.knots,
+                    gravity,
+                    window.samples,
                     self._mounting,
-                    *self._factor.marginals(),
+                    *factor.marginals(),
                     self._gyro_only,
+                    None if displacement is None else displacement[0],
                 ),
                 self._predict,
+                self._predicted_common,
             )
         return self._trajectory
 
-    def common_at(self, time_s: float, *, dim: int = _POSE_DIM) -> FloatArray | None:  # noqa: ARG002
+    def common_at(self, time_s: float, *, dim: int = _POSE_DIM) -> FloatArray | None:
         """Return the (1, 6, 6) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""
-        return None
+        if self._sensitivity is None:
+            return None
+        assert self._predictor is not None  # noqa: S101 (only called while initialised)
+        if time_s < self._predictor.time_s:
+            return self.trajectory().common_at(np.array([time_s]), dim=dim)
+        return self._predicted_common(time_s, dim)
+
+    def _predicted_common(self, time_s: float, dim: int) -> FloatArray:
+        assert self._predictor is not None  # noqa: S101 (only called while initialised)
+        assert self._samples is not None  # noqa: S101 (initialised)
+        displacement = self._window_displacement()
+        assert displacement is not None  # noqa: S101 (only called where the set-up is uncertain)
+        newest = np.concatenate([displacement[0][-1], displacement[1]])
+        displaced = self._predictor.by_start(time_s, self._samples)[:dim] @ newest
+        covariance: FloatArray = (displaced @ displaced.T)[None]
+        return covariance
+
+    def _window_displacement(self) -> tuple[FloatArray, FloatArray] | None:
+        """Displacement of the knots and the tilt by the set-up, computed once per solution; None: unknown."""
+        if self._sensitivity is not None and self._displacement is None:
+            assert self._solved is not None  # noqa: S101 (only called while initialised)
+            self._displacement = self._sensitivity.displacement(self._solved.linearised, self._solved.factor)
+        return self._displacement
 
     def _discard_trajectory(self) -> None:
-        self._window, self._factor, self._predictor, self._trajectory = None, None, None, None
+        self._window, self._solved, self._predictor, self._trajectory = None, None, None, None
 
     def _mounted(self, observations: Observations) -> Observations:
         return replace(observations, layout=self._mounting.in_imu(observations.layout))
@@ -217,6 +279,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
+        self._health.advance(float(new.time_s[-1]))
         if not self._converged:
             self._searched = merge_observations(self._searched, new)
         super().update(new)
@@ -229,7 +292,17 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._converged, self._newest_nis = False, 0.0
         self._monitor.reset(observations)
         self._discard_trajectory()
+        self.residuals_m = np.full((len(observations), 3), np.nan)
+        if self._samples is None or not len(self._samples):
+            raise GeometryError("no samples of the IMU")
+        # Before the first sample nothing links the measurements.
+        begin_s = float(self._samples.end_s[0] - self._samples.duration_s[0])
+        if observations.time_s[0] < begin_s:
+            self._horizon_s = begin_s
+            self._select(observations.time_s >= begin_s)
+            observations = observations.select(observations.time_s >= begin_s)
         searched = observations if self._searched is None else self._searched
+        searched = searched.select(searched.time_s >= begin_s)
         found = self._search(searched)
         knots = found.knots
         prior = diffuse_inertial_prior(knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only)
@@ -241,7 +314,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
         # Without measurements before the horizon, which the start needed.
         held = searched.time_s >= self._horizon_s
         first = int(found.knot_index[held][0])
-        outliers = self._accept(found.gravity, found.factor, found)[held]
+        self._anchor_displacement = None
+        outliers = self._accept(self._mounted(searched), found.knot_index, found.gravity, found.factor, found)
+        outliers = outliers[held]
         if self._converged:
             if first > 0:
                 self._eliminate(searched, found.knot_index, first, ~held)
@@ -253,15 +328,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def _search(self, observations: Observations) -> InertialSolution:
         """Find the trajectory of measurements without any prior knowledge."""
-        newest_s = float(observations.time_s[-1])
-        if self._samples is None or newest_s < self._next_search_s:
-            raise GeometryError("no samples of the IMU, or too little measured since the last search")
-        # Before the first sample nothing links the measurements.
-        with_samples = observations.time_s >= self._samples.end_s[0] - self._samples.duration_s[0]
-        if not with_samples.all():
-            raise GeometryError("measurements precede the samples of the IMU")
         if len(observations) < MIN_MEASUREMENTS:
             raise GeometryError("too few measurements")
+        newest_s = float(observations.time_s[-1])
+        if newest_s < self._next_search_s:
+            raise GeometryError("too little measured since the last search")
         if len(np.unique(observations.prism)) == 1 and _path_m(observations) < MIN_PATH_M:
             raise GeometryError("one prism alone tells the heading of a robot only in motion")
         length_s = newest_s - float(observations.time_s[0])
@@ -303,7 +374,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
         nis, sequential_nis = normalised_innovations(
             system.whitened[is_new], knot_index[is_new], system.gradient, solve_system
         )
+        if self._health.innovations(observations.time_s[is_new], observations.prism[is_new], nis):
+            self._samples, self._searched, self._next_search_s = None, None, -np.inf
+            return False
         weights = self._weigh(nis, sequential_nis)
+        system.weights[is_new] = weights
         add_measurements(
             system.whitened[is_new], weights, knot_index[is_new], system.diagonal, system.gradient
         )
@@ -314,7 +389,13 @@ class InertialFixedLagSmoother(MeasurementWindow):
             knots, gravity = knots.retract(step), replace(gravity, tilt=gravity.tilt + tilt)
             if gain < COST_TOLERANCE or (np.all(weights == 1.0) and is_below_step_tolerance(step)):
                 self._window = replace(window, knots=knots)
-                outliers = self._accept(gravity, factor, apply_linear_step(system, knot_index, step, gain))
+                outliers = self._accept(
+                    observations,
+                    knot_index,
+                    gravity,
+                    factor,
+                    apply_linear_step(system, knot_index, step, gain),
+                )
                 break
             system = assembled(None)
         else:
@@ -327,7 +408,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
                 factors=window.factors,
             )
             self._window = replace(window, knots=found.knots, factors=found.factors)
-            outliers = self._accept(found.gravity, found.factor, found)
+            outliers = self._accept(observations, knot_index, found.gravity, found.factor, found)
             self._converged &= found.iterations < MAX_ITERATIONS
         self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
         return self._converged
@@ -379,11 +460,25 @@ class InertialFixedLagSmoother(MeasurementWindow):
         return old.joined(found).select(row)
 
     def _accept(
-        self, gravity: Gravity, factor: BorderedCholesky, found: InertialEquations | InertialSolution
+        self,
+        observations: Observations,
+        knot_index: NDArray[np.intp],
+        gravity: Gravity,
+        factor: BorderedCholesky,
+        found: InertialEquations | InertialSolution,
     ) -> NDArray[np.bool_]:
         """Make a solution the trajectory; return which measurements are outliers."""
         assert self._window is not None  # noqa: S101 (it was solved)
-        self._gravity, self._factor, self._trajectory = gravity, factor, None
+        linearised = Linearised(
+            observations,
+            found.linearised,
+            found.weights,
+            knot_index,
+            self._window.anchor,
+            self._anchor_displacement,
+        )
+        self._solved = _Solved(self._window, gravity, factor, linearised)
+        self._gravity, self._trajectory, self._displacement = gravity, None, None
         self.residuals_m = found.linearised.residuals_m
         covariance = factor.last_covariance()
         self._predictor = StrapdownPredictor(
@@ -416,8 +511,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Marginalise the knots before one, and measurements, into an anchor prior on it."""
         assert self._window is not None  # noqa: S101 (converged)
         window = self._window
+        past = self._mounted(observations.select(is_past))
         system = window.select(slice(first + 1)).assemble(
-            self._mounted(observations.select(is_past)),
+            past,
             knot_index[is_past],
             window.knots.select(slice(first + 1)),
             self._gravity,
@@ -425,6 +521,10 @@ class InertialFixedLagSmoother(MeasurementWindow):
         )
         factor = _factorise(system)
         step, tilt = factor.solve(-system.gradient, -system.corner_gradient)
+        if self._sensitivity is not None:
+            linearised = system.linearised, system.weights, knot_index[is_past]
+            solved = Linearised(past, *linearised, window.anchor, self._anchor_displacement)
+            self._anchor_displacement = self._sensitivity.at_last(solved, factor)
         anchor = InertialAnchor(
             window.knots.select(slice(first, first + 1)),
             self._gravity.tilt,
@@ -476,30 +576,55 @@ class _Window:
         )
 
 
+class _Solved(NamedTuple):
+    """A solution of the window."""
+
+    window: _Window  # With the solution's knots
+    gravity: Gravity
+    factor: BorderedCholesky
+    linearised: Linearised
+
+
 @dataclass(frozen=True, slots=True)
 class WindowTrajectory:
     """The trajectory of a window, and its prediction beyond the newest knot."""
 
     inside: InertialTrajectory
     predict: Callable[[float, int], tuple[States, FloatArray]]
+    predicted_common: Callable[[float, int], FloatArray]
 
     def at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
         """Return states of the reference point at N times from the first knot on, and the (N, 6, 6) covariance of poses."""
-        knots_s = self.inside.knots.time_s
-        beyond = time_s > knots_s[-1] if len(knots_s) > 1 else np.ones(len(time_s), np.bool_)
+        beyond = self._beyond(time_s)
         parts = []
         if not beyond.all() or not len(time_s):
             parts.append(self.inside.at(time_s[~beyond], dim=dim))
         parts += [self.predict(each, dim) for each in time_s[beyond].tolist()]
         if len(parts) == 1:
             return parts[0]
-        order = np.argsort(np.concatenate([np.flatnonzero(~beyond), np.flatnonzero(beyond)]))
+        order = _order(beyond)
         states = concatenate_states([each for each, _ in parts])
         return states.select(order), np.concatenate([each for _, each in parts])[order]
 
     def common_at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> FloatArray | None:
         """Return the (N, 6, 6) covariance that the set-up's uncertainty adds; None: unknown."""
-        return self.inside.common_at(time_s, dim=dim)
+        if self.inside.displacement is None:
+            return None
+        beyond = self._beyond(time_s)
+        parts = [self.inside.common_at(time_s[~beyond], dim=dim)] if not beyond.all() else []
+        parts += [self.predicted_common(each, dim) for each in time_s[beyond].tolist()]
+        known = [each for each in parts if each is not None]
+        return np.concatenate(known)[_order(beyond)] if known else np.empty((0, dim, dim))
+
+    def _beyond(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Whether times are predicted; a single knot has no inside."""
+        knots_s = self.inside.knots.time_s
+        return time_s > knots_s[-1] if len(knots_s) > 1 else np.ones(len(time_s), np.bool_)
+
+
+def _order(beyond: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Order of time of rows inside, then rows beyond."""
+    return np.argsort(np.concatenate([np.flatnonzero(~beyond), np.flatnonzero(beyond)]))
 
 
 def _propagate(

@@ -1,26 +1,71 @@
 """What the measurements' residuals and the set-up's errors say about a trajectory with an IMU. Sans-I/O.
 
 The set-up's error displaces the states by ``-H^-1 C`` as without an IMU (``geometry.trajectory.sensitivity``); the tilt of
-gravity, which borders H, takes part of it.
+gravity, which borders H, takes part of it. In a window that moves with time the mean of the anchor prior moves with the set-up.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from tsgt.geometry.inertial.factors import by_inertial_states
-from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.inertial.bordered import BorderedCholesky
+    from tsgt.geometry.inertial.factors import InertialAnchor
     from tsgt.geometry.inertial.solver import InertialSolution
     from tsgt.geometry.inertial.states import Mounting
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import Observations, SetupJacobian
+    from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, SetupJacobian
 
 MIN_VARIANCE_SHARE = 1e-3  # Of the noise; below, the trajectory follows the measurement exactly
+
+
+class Linearised(NamedTuple):
+    """Measurements, with the layout in the axes of the IMU, as they were linearised and solved."""
+
+    observations: Observations
+    linearised: LinearisedMeasurements
+    weights: FloatArray
+    knot_index: NDArray[np.intp]
+    anchor: InertialAnchor | None = None  # That depends on the set-up
+    anchor_displacement: FloatArray | None = None  # (17, r) of its mean
+
+
+class InertialSensitivity:
+    """Displacement of states and tilt by the set-up's errors, in the columns of a factor of their covariance."""
+
+    def __init__(self, setup_jacobian: SetupJacobian, mounting: Mounting, *, gyro_only: bool) -> None:
+        self._by_setup, self._mounting, self._gyro_only = setup_jacobian, mounting, gyro_only
+
+    def displacement(self, solved: Linearised, factor: BorderedCholesky) -> tuple[FloatArray, FloatArray]:
+        """(K, 15, r) displacement of K knots, and (2, r) of the tilt."""
+        observations, linearised, weights, knot_index, anchor, anchor_displacement = solved
+        # Prisms are uncertain along the axes of the robot.
+        of_robot = replace(linearised, rotation=linearised.rotation @ self._mounting.rotation.T)
+        by_setup = self._by_setup(observations, of_robot)
+        jacobian = _jacobian(linearised, gyro_only=self._gyro_only)
+        information = np.linalg.inv(linearised.covariance(observations)) * weights[:, None, None]
+        mixed = np.zeros((len(factor.border), INERTIAL_STATE_DIM, by_setup.shape[2]))
+        np.add.at(mixed, knot_index, np.swapaxes(jacobian, 1, 2) @ (information @ by_setup))
+        shared = np.zeros((TILT_DIM, by_setup.shape[2]))
+        if anchor is not None and anchor_displacement is not None:
+            by_anchor = anchor.information @ anchor_displacement
+            mixed[0] -= by_anchor[:INERTIAL_STATE_DIM]
+            shared -= by_anchor[INERTIAL_STATE_DIM:]
+        displaced, shared_displaced = factor.solve(mixed, shared)
+        return -displaced, -shared_displaced
+
+    def at_last(self, solved: Linearised, factor: BorderedCholesky) -> FloatArray:
+        """(17, r) displacement of the last knot and the tilt: that of the anchor prior on it."""
+        states, shared = self.displacement(solved, factor)
+        return np.concatenate([states[-1], shared])
 
 
 def setup_displacement(
@@ -29,23 +74,15 @@ def setup_displacement(
     mounting: Mounting,
     setup_jacobian: SetupJacobian,
 ) -> FloatArray:
-    """(K, 15, r) displacement of the states by the set-up's errors, in the columns of a factor of their covariance.
+    """(K, 15, r) displacement of the states of a solution by the set-up's errors.
 
     ``observations``: that were solved, with the layout in the axes of the IMU.
     """
-    linearised = solution.linearised
-    # Prisms are uncertain along the axes of the robot.
-    of_robot = replace(linearised, rotation=linearised.rotation @ mounting.rotation.T)
-    by_setup = setup_jacobian(observations, of_robot)
-    jacobian = _jacobian(solution)
-    information = np.linalg.inv(linearised.covariance(observations)) * solution.weights[:, None, None]
-    mixed = np.zeros((len(solution.knots), INERTIAL_STATE_DIM, by_setup.shape[2]))
-    np.add.at(mixed, solution.knot_index, np.swapaxes(jacobian, 1, 2) @ (information @ by_setup))
-    factor = solution.factor
-    alone = factor.states.solve(mixed)
-    shared = factor.shared_covariance @ np.einsum("kbs,kbr->sr", factor.border, alone)
-    displaced: FloatArray = -(alone + factor.solved_border @ shared)
-    return displaced
+    solved = Linearised(observations, solution.linearised, solution.weights, solution.knot_index)
+    gyro_only = not solution.factors.with_accelerometer
+    return InertialSensitivity(setup_jacobian, mounting, gyro_only=gyro_only).displacement(
+        solved, solution.factor
+    )[0]
 
 
 def residual_variances(
@@ -57,16 +94,13 @@ def residual_variances(
     Q_vv = Q_ll - A Q_xx A^T (Baarda 1968, A testing procedure for use in geodetic networks).
     """
     noise = np.diagonal(solution.linearised.covariance(observations), axis1=1, axis2=2)
-    jacobian = _jacobian(solution)
+    jacobian = _jacobian(solution.linearised, gyro_only=not solution.factors.with_accelerometer)
     own = np.einsum("mij,mjk,mik->mi", jacobian, covariance[solution.knot_index], jacobian, optimize=True)
     expected = noise - solution.weights[:, None] * own
     return np.where(expected > MIN_VARIANCE_SHARE * noise, expected, np.nan)
 
 
-def _jacobian(solution: InertialSolution) -> FloatArray:
+def _jacobian(linearised: LinearisedMeasurements, *, gyro_only: bool) -> FloatArray:
     """(M, 3, 15) of the residuals by the states."""
-    linearised = solution.linearised
     rows = np.concatenate([linearised.jacobian, linearised.residuals_m[:, :, None]], axis=2)
-    return by_inertial_states(rows, gyro_only=not solution.factors.with_accelerometer)[
-        :, :, :INERTIAL_STATE_DIM
-    ]
+    return by_inertial_states(rows, gyro_only=gyro_only)[:, :, :INERTIAL_STATE_DIM]

@@ -30,6 +30,7 @@ from tsgt.geometry.trajectory.gauss_newton import (
     solve,
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
+from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
     MAX_STEPS,
@@ -71,7 +72,7 @@ class FixedLagSmoother(MeasurementWindow):
     """
 
     def __init__(self, prior: MotionPrior, setup_jacobian: SetupJacobian | None = None) -> None:
-        super().__init__()
+        super().__init__(InnovationMonitor())
         self._prior = prior
         self._common = None if setup_jacobian is None else WindowSensitivity(setup_jacobian)
         self._knots: States | None = None

@@ -20,9 +20,14 @@ AMBIGUITY_MARGIN_S = 1.5  # Before the first inconsistent measurement: a few of 
 
 
 class InnovationMonitor:
-    """Tracks innovations: the state is ambiguous while the newest of a prism is inconsistent (``inconsistent_prisms``)."""
+    """Tracks innovations: the state is ambiguous while the newest of a prism is inconsistent (``inconsistent_prisms``).
 
-    def __init__(self) -> None:
+    ``alone``: as many consistent measurements in succession of one prism resolve an ambiguity without other prisms.
+    """
+
+    def __init__(self, alone: int | None = None) -> None:
+        self._alone = alone
+        self._succession = 0
         self.inconsistent_prisms: frozenset[int] = frozenset()
         self._inconsistent_from_s = np.inf
         self._flagged = np.empty(0, np.bool_)
@@ -48,6 +53,7 @@ class InnovationMonitor:
         """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
         self._flagged = np.zeros(len(observations), np.bool_)
+        self._succession = 0
 
     def set_start(self, time_s: float) -> None:
         """Start the ambiguity after the measurements of the initialised trajectory."""
@@ -91,6 +97,9 @@ class InnovationMonitor:
             self.inconsistent_prisms = (
                 self.inconsistent_prisms | {prism} if is_flagged else self.inconsistent_prisms & {prism}
             )
+            self._succession = 0 if is_flagged else self._succession + 1
+            if self._alone is not None and self._succession >= self._alone:
+                self.inconsistent_prisms = frozenset()
         # A flagged measurement that is no outlier has bent the trajectory: consistent innovations before it prove nothing.
         self.inconsistent_prisms |= frozenset(observations.prism[is_new & flagged & ~outliers].tolist())
         if not self.inconsistent_prisms and flagged.any():

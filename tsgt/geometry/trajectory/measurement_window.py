@@ -62,10 +62,10 @@ class MeasurementWindow(ABC):
     a trajectory.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, monitor: InnovationMonitor) -> None:
         self._horizon_s = -np.inf
         self._converged = False
-        self._monitor = InnovationMonitor()
+        self._monitor = monitor
         self._reliable_from_s = np.inf
         self._newest_nis = 0.0
         self.observations: Observations | None = None

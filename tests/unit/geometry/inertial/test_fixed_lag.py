@@ -19,7 +19,7 @@ from tsgt.model import MotionPrior
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import InertialSamples
-    from tsgt.geometry.trajectory import Observations
+    from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, SetupJacobian
 
 IMU = imu_parameters()
 DRIVE = inertial_drive(11.0, seed=12)
@@ -39,8 +39,10 @@ def measurements(stations: int = 3) -> Observations:
 class Live:
     """A smoother that is given measurements and lines of samples as they arrive."""
 
-    def __init__(self, *, gyro_only: bool = False) -> None:
-        self.window = InertialFixedLagSmoother(IMU, MotionPrior(), reference_m=CENTROID, gyro_only=gyro_only)
+    def __init__(self, *, gyro_only: bool = False, setup_jacobian: SetupJacobian | None = None) -> None:
+        self.window = InertialFixedLagSmoother(
+            IMU, MotionPrior(), reference_m=CENTROID, setup_jacobian=setup_jacobian, gyro_only=gyro_only
+        )
         self._sampled = 0
 
     def sample_until(self, time_s: float, samples: InertialSamples = SAMPLES) -> None:
@@ -176,32 +178,27 @@ def test_late_samples_and_measurements_count() -> None:
     """Within the lag the order of arrival does not matter."""
     observations = measurements()
     observations = observations.select(observations.time_s < UNTIL_S)
-    late = Live()
-    late.measure(observations.select(slice(None, -8)))
-    late.measure(observations.select(slice(-7, None)))
-    samples = SAMPLES.select(slice(len(SAMPLES)))
-    stop = int(np.searchsorted(samples.end_s, UNTIL_S + DELAY_S))
-    # Ten samples before the newest knots come after all others.
+    stop = int(np.searchsorted(SAMPLES.end_s, UNTIL_S + DELAY_S))
+    # Ten samples before the newest knots come after all others but the last measurement, another measurement last of all.
     gone = slice(stop - 150, stop - 140)
-    order = Live()
-    order.measure(observations.select(slice(None, -8)))
-    order.window.add_samples(samples.select(slice(order._sampled, gone.start)))
-    order.window.add_samples(samples.select(slice(gone.stop, stop)))
-    order._sampled = stop
-    order.measure(observations.select(slice(-8, -1)))
-    order.window.add_samples(samples.select(gone))
-    order.measure(observations.select(slice(-1, None)))
-    late.window.update(observations.select(slice(-8, -7)))
+    live = Live()
+    live.measure(observations.select(slice(None, -9)))
+    live.window.add_samples(SAMPLES.select(slice(live._sampled, gone.start)))
+    live.window.add_samples(SAMPLES.select(slice(gone.stop, stop)))
+    live._sampled = stop
+    live.measure(observations.select(slice(-8, -1)))
+    live.window.add_samples(SAMPLES.select(gone))
+    live.measure(observations.select(slice(-1, None)))
+    live.window.update(observations.select(slice(-9, -8)))
     in_order = tracked().window
     at_s = observations.time_s[-1:] - 0.05
     expected, covariance = in_order.trajectory().at(at_s)
     sigmas = np.sqrt(np.diag(covariance[0]))
-    for live in (late, order):
-        found, _ = live.window.trajectory().at(at_s)
-        error = np.concatenate(
-            [found.position - expected.position, difference(found.rotation, expected.rotation)], axis=1
-        )
-        assert np.abs(error / sigmas).max() < 0.1
+    found, _ = live.window.trajectory().at(at_s)
+    error = np.concatenate(
+        [found.position - expected.position, difference(found.rotation, expected.rotation)], axis=1
+    )
+    assert np.abs(error / sigmas).max() < 0.1
 
 
 def test_outage_is_bridged_and_tracked_on() -> None:
@@ -247,3 +244,33 @@ def test_gyro_alone() -> None:
     error_m = np.linalg.norm(state.position - position - rotation @ CENTROID)
     assert error_m < 3 * np.sqrt(np.trace(covariance[0, :3, :3]))
     assert np.linalg.norm(difference(state.rotation, rotation)) < 0.3 * DEG
+
+
+def test_common_covariance_equals_that_of_a_displaced_setup() -> None:
+    """One station stands 0.4 mm elsewhere: poses move by what the common covariance says, smoothed and predicted."""
+    observations = measurements(2)
+    observations = observations.select(observations.time_s < 5.0)
+    shift = np.array([0.0003, -0.0002, 0.0001])
+
+    def by_setup(some: Observations, linearised: LinearisedMeasurements) -> FloatArray:
+        found: FloatArray = -(linearised.by_point @ shift)[:, :, None] * (some.station == 1)[:, None, None]
+        return found
+
+    frames = observations.frames.copy()
+    frames[1, :3, 3] += shift
+    live, moved = Live(setup_jacobian=by_setup), Live()
+    live.measure(observations)
+    moved.measure(replace(observations, frames=frames))
+    newest_s = float(observations.time_s[-1])
+    for time_s in (newest_s - 1.03, newest_s - 0.1, newest_s + 0.3, newest_s + DELAY_S + 0.1):
+        (expected, _), (found, _) = moved.window.predict(time_s), live.window.predict(time_s)
+        common = live.window.common_at(time_s)
+        assert common is not None
+        error = np.concatenate(
+            [expected.position - found.position, difference(expected.rotation, found.rotation)], axis=1
+        )
+        scale = np.sqrt(np.diag(common[0]))
+        np.testing.assert_allclose(np.abs(error[0]), scale, rtol=0.05, atol=0.05 * scale.max())
+        of_trajectory = live.window.trajectory().common_at(np.array([time_s]))
+        assert of_trajectory is not None
+        np.testing.assert_allclose(of_trajectory, common, rtol=1e-9, atol=1e-15)

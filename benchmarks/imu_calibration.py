@@ -23,7 +23,7 @@ from tsgt.analysis.calibration import calibrate_recorded_imu
 from tsgt.config import SimulatedImu, SuperframeMasterConfig
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial import Mounting
-from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
+from tsgt.geometry.inertial_calibration import ImuSetup, in_calibrated_axes
 from tsgt.log import configure_logging
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.options import SimulationOptions
@@ -92,7 +92,7 @@ def calibrated(mission: RecordedMission, seed: int) -> tuple[FloatArray, FloatAr
     cpu_s = time.process_time() - started_s
     configured = found.configured
     calibration = found.calibration
-    exact = in_main_axes(
+    exact = in_calibrated_axes(
         ImuSetup(
             Mounting(
                 rotation_from_quaternion(np.array(configured.orientation_xyzw)),
@@ -102,7 +102,7 @@ def calibrated(mission: RecordedMission, seed: int) -> tuple[FloatArray, FloatAr
             np.asarray(np.linalg.inv(mission.gyro_matrix), np.float64),
             np.asarray(np.linalg.inv(mission.accelerometer_matrix), np.float64),
             np.zeros(3),
-            calibration.setup.main_axis,
+            calibration.setup.vertical,
         )
     )
     estimate = rotation_from_quaternion(np.array(found.parameters.orientation_xyzw))

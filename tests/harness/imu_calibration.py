@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion
 from tsgt.geometry.inertial import Gravity, Mounting
-from tsgt.geometry.inertial_calibration import ImuSetup, in_main_axes
+from tsgt.geometry.inertial_calibration import ImuSetup, in_calibrated_axes
 from tsgt.model import ImuSamples, Parameters, PointMeasurement, PrismPosition, StationParameters
 from tsgt.recording import encode_line
 
@@ -69,16 +69,15 @@ def uncalibrated_drive(
         specific_force_mps2=exact.specific_force_mps2 @ accelerometer.T,
     )
     centroid = drive.layout.mean(axis=0)
-    truth = in_main_axes(
+    mounted = rotation_from_quaternion(np.array(imu.orientation_xyzw))
+    truth = in_calibrated_axes(
         ImuSetup(
-            Mounting(
-                rotation_from_quaternion(np.array(imu.orientation_xyzw)), np.array(imu.position_m) - centroid
-            ),
+            Mounting(mounted, np.array(imu.position_m) - centroid),
             latency_s,
             np.asarray(np.linalg.inv(gyro), np.float64),
             np.asarray(np.linalg.inv(accelerometer), np.float64),
             np.zeros(3),
-            2,
+            mounted[2],
         )
     )
     observations = replace(drive.measure(seed=seed), layout=drive.layout - centroid)

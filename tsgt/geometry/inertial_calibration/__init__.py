@@ -11,7 +11,7 @@ from tsgt.geometry.inertial_calibration.observability import (
     robot_covariance,
     setup_components,
 )
-from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_main_axes
+from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_calibrated_axes
 from tsgt.geometry.inertial_calibration.setup_check import Cause, SetupCheck, SetupFinding, check_imu_setup
 
 __all__ = [
@@ -26,7 +26,7 @@ __all__ = [
     "align",
     "calibrate_imu",
     "check_imu_setup",
-    "in_main_axes",
+    "in_calibrated_axes",
     "robot_covariance",
     "series_of_samples",
     "series_of_states",

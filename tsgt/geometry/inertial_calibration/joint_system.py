@@ -205,13 +205,13 @@ def motion_by_matrices(
     )
     # From errors by which values are multiplied to those that are added to the matrices.
     by_gyro = np.einsum(
-        "kril,jl,sij->krs", by_rate, np.linalg.inv(setup.gyro_matrix), gyro_directions(setup.main_axis)
+        "kril,jl,sij->krs", by_rate, np.linalg.inv(setup.gyro_matrix), gyro_directions(setup.vertical)
     )
     by_accelerometer = np.einsum(
         "kril,jl,sij->krs",
         by_force,
         np.linalg.inv(setup.accelerometer_matrix),
-        accelerometer_directions(setup.main_axis),
+        accelerometer_directions(setup.vertical),
     )
     by_error = np.concatenate([by_gyro, by_accelerometer], axis=2)
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))

@@ -15,7 +15,6 @@ from tsgt.geometry.inertial_calibration.setup import (
     POSITION,
     ROTATION,
     gyro_directions,
-    other_axes,
 )
 
 if TYPE_CHECKING:
@@ -28,6 +27,20 @@ LATENCY_LIMIT_S = 0.001
 """One sigma beyond which a component counts as undetermined: more harms the poses."""
 
 MAX_SHARE_OF_PRIOR = 0.5  # Of the sigma of a component of the gyro matrix
+
+MIN_FREE_SHARE = (
+    0.2  # Of the prior sigma that is left to an entry of the matrix by the definition of the axes
+)
+
+_MATRIX_ENTRIES = [
+    *((f"scale of the gyro's {'xyz'[axis]}", axis, axis) for axis in range(3)),
+    *(
+        (f"cross-axis sensitivity of the gyro's {'xyz'[row]} to {'xyz'[column]}", row, column)
+        for row in range(3)
+        for column in range(3)
+        if row != column
+    ),
+]
 
 _ADVICE = {
     "rotation": "accelerate, brake and turn more",
@@ -70,22 +83,18 @@ def setup_components(calibration: ImuCalibration) -> list[SetupComponent]:
     )
     # What the factory has calibrated needs no motion.
     trusted = calibration.matrix_sigma < UNCALIBRATED
-    names = _matrix_names(calibration.setup.main_axis)
-    for name, value, before in zip(
-        names, sigmas[GYRO_MATRIX].tolist(), prior[GYRO_MATRIX].tolist(), strict=True
-    ):
+    directions = gyro_directions(calibration.setup.vertical)
+    by_entry = directions.reshape(len(directions), 9).T
+    of_matrix = by_entry @ calibration.covariance[GYRO_MATRIX, GYRO_MATRIX] @ by_entry.T
+    values = np.sqrt(np.diag(of_matrix)).reshape(3, 3)
+    priors = np.linalg.norm(by_entry * prior[GYRO_MATRIX], axis=1).reshape(3, 3)
+    for name, row, column in _MATRIX_ENTRIES:
+        value, before = float(values[row, column]), float(priors[row, column])
+        if before < MIN_FREE_SHARE * calibration.matrix_sigma:
+            continue  # Defined by the axes
         determined = trusted or value < MAX_SHARE_OF_PRIOR * before
         found.append(SetupComponent(name, value, before, determined, _ADVICE["gyro"]))
     return found
-
-
-def _matrix_names(main_axis: int) -> list[str]:
-    i, j = other_axes(main_axis)
-    pairs = [(i, j), (j, i), (main_axis, i), (main_axis, j)]
-    return [
-        *(f"scale of the gyro's {axis}" for axis in "xyz"),
-        *(f"cross-axis sensitivity of the gyro's {'xyz'[a]} to {'xyz'[b]}" for a, b in pairs),
-    ]
 
 
 def robot_covariance(calibration: ImuCalibration) -> FloatArray:
@@ -95,6 +104,6 @@ def robot_covariance(calibration: ImuCalibration) -> FloatArray:
     jacobian[0:3, POSITION] = np.eye(3)
     jacobian[3:6, ROTATION] = setup.mounting.rotation
     jacobian[6, LATENCY] = 1.0
-    jacobian[7:16, GYRO_MATRIX] = gyro_directions(setup.main_axis).reshape(7, 9).T
+    jacobian[7:16, GYRO_MATRIX] = gyro_directions(setup.vertical).reshape(7, 9).T
     covariance = jacobian @ calibration.covariance @ jacobian.T
     return np.asarray(0.5 * (covariance + covariance.T))

@@ -4,9 +4,9 @@ The parameters of an error have these components: rotation of the mounting (abou
 its origin (robot frame), latency, gyro matrix, accelerometer matrix, and the delay of each station's times.
 
 A rotation of the axes of gyro and accelerometer together cannot be told from one of the mounting, so that both matrices have three
-components less. The axes of the IMU are defined by what the motion determines best: its main axis, that nearest to the robot's z
-axis, is the gyro's, and about it the axes are turned as those of the accelerometer are on average. The accelerometer's matrix and
-the delays are estimated for the sake of the others.
+components less. The axes of the IMU are defined by what the motion of a vehicle determines best: the direction that is vertical when
+the robot stands level is the gyro's, and about it the axes are turned as those of the accelerometer are on average. The accelerometer's
+matrix and the delays are estimated for the sake of the others.
 """
 
 from __future__ import annotations
@@ -33,31 +33,26 @@ DELAY_SIGMA_S = 5e-4
 """One sigma of a station's mean time: its instrument's clock is fitted to half a millisecond (docs/explanation/instrument-time.md)."""
 
 
-def gyro_directions(main_axis: int) -> FloatArray:
-    """(7, 3, 3) free components of the gyro matrix: three scale factors and four of misalignment."""
-    i, j = other_axes(main_axis)
-    directions = np.zeros((7, 3, 3))
-    directions[np.arange(3), np.arange(3), np.arange(3)] = 1.0
-    directions[3, i, j] = directions[4, j, i] = 1.0
-    directions[5, main_axis, i] = directions[6, main_axis, j] = 1.0
-    return directions
+def gyro_directions(vertical: FloatArray) -> FloatArray:
+    """(7, 3, 3) orthonormal free components of the gyro matrix: a rate about the vertical stays one."""
+    frame = _frame(vertical)
+    products = frame[:, None, :, None] * frame[None, :, None, :]
+    return np.stack([products[i, j] for i in range(3) for j in range(3) if (i, j) not in {(0, 2), (1, 2)}])
 
 
-def accelerometer_directions(main_axis: int) -> FloatArray:
-    """(8, 3, 3) free components of the accelerometer's matrix: it is symmetric in the axes other than the main one."""
-    i, j = other_axes(main_axis)
-    entries = [(row, column) for row in range(3) for column in range(3) if (row, column) != (j, i)]
-    directions = np.zeros((8, 3, 3))
-    for direction, entry in zip(directions, entries, strict=True):
-        direction[entry] = 1.0
-        if entry == (i, j):
-            direction[j, i] = 1.0
-    return directions
+def accelerometer_directions(vertical: FloatArray) -> FloatArray:
+    """(8, 3, 3) orthonormal free components of the accelerometer's matrix: it does not turn about the vertical."""
+    frame = _frame(vertical)
+    products = frame[:, None, :, None] * frame[None, :, None, :]
+    others = [products[i, j] for i in range(3) for j in range(3) if (i, j) not in {(0, 1), (1, 0)}]
+    return np.stack([*others, (products[0, 1] + products[1, 0]) / np.sqrt(2.0)])
 
 
-def other_axes(main_axis: int) -> tuple[int, int]:
-    """Return the two axes beside the main one, such that they and the main axis are right-handed."""
-    return (main_axis + 1) % 3, (main_axis + 2) % 3
+def _frame(vertical: FloatArray) -> FloatArray:
+    """(3, 3) right-handed orthonormal vectors, one per row; the last is the vertical."""
+    first = np.cross(np.eye(3)[(int(np.argmax(np.abs(vertical))) + 1) % 3], vertical)
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(vertical, first), vertical])
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +64,14 @@ class ImuSetup:
     gyro_matrix: FloatArray  # (3, 3) the angular rate is this times the sample, less the bias
     accelerometer_matrix: FloatArray  # (3, 3) likewise
     delays_s: FloatArray  # (S,) by which the times of a station's measurements are early
-    main_axis: int  # 0 to 2
+    vertical: (
+        FloatArray  # (3,) unit vector near the robot's z axis, in the axes of the IMU, that defines these
+    )
 
     @classmethod
     def initial(cls, mounting: Mounting, latency_s: float, stations: int) -> ImuSetup:
-        """Return a set-up without errors of scale and alignment; the main axis is that nearest to the robot's z axis."""
-        main_axis = int(np.argmax(np.abs(mounting.rotation[2])))
-        return cls(mounting, latency_s, np.eye(3), np.eye(3), np.zeros(stations), main_axis)
+        """Return a set-up without errors of scale and alignment."""
+        return cls(mounting, latency_s, np.eye(3), np.eye(3), np.zeros(stations), mounting.rotation[2].copy())
 
     @property
     def dim(self) -> int:
@@ -89,11 +85,11 @@ class ImuSetup:
                 self.mounting.rotation @ exp_so3(error[ROTATION]), self.mounting.position + error[POSITION]
             ),
             self.latency_s + float(error[LATENCY]),
-            self.gyro_matrix + np.einsum("i,ijk->jk", error[GYRO_MATRIX], gyro_directions(self.main_axis)),
+            self.gyro_matrix + np.einsum("i,ijk->jk", error[GYRO_MATRIX], gyro_directions(self.vertical)),
             self.accelerometer_matrix
-            + np.einsum("i,ijk->jk", error[ACCELEROMETER_MATRIX], accelerometer_directions(self.main_axis)),
+            + np.einsum("i,ijk->jk", error[ACCELEROMETER_MATRIX], accelerometer_directions(self.vertical)),
             self.delays_s + error[DELAYS],
-            self.main_axis,
+            self.vertical,
         )
 
     def local_coordinates_about(self, other: ImuSetup) -> FloatArray:
@@ -103,9 +99,9 @@ class ImuSetup:
                 log_so3(other.mounting.rotation.T @ self.mounting.rotation),
                 self.mounting.position - other.mounting.position,
                 [self.latency_s - other.latency_s],
-                _components(gyro_directions(self.main_axis), self.gyro_matrix - other.gyro_matrix),
+                _components(gyro_directions(self.vertical), self.gyro_matrix - other.gyro_matrix),
                 _components(
-                    accelerometer_directions(self.main_axis),
+                    accelerometer_directions(self.vertical),
                     self.accelerometer_matrix - other.accelerometer_matrix,
                 ),
                 self.delays_s - other.delays_s,
@@ -115,11 +111,13 @@ class ImuSetup:
 
 def gyro_rotation(setup: ImuSetup) -> FloatArray:
     """(3, D) Jacobian of the rotation of the gyro's axes, the average of the three, by the error of a set-up."""
-    i, j = other_axes(setup.main_axis)
     jacobian = np.zeros((3, setup.dim))
     jacobian[:, ROTATION] = np.eye(3)
-    directions = gyro_directions(setup.main_axis)
-    jacobian[setup.main_axis, GYRO_MATRIX] = 0.5 * (directions[:, j, i] - directions[:, i, j])
+    first, second, vertical = _frame(setup.vertical)
+    directions = gyro_directions(setup.vertical)
+    jacobian[:, GYRO_MATRIX] = 0.5 * np.outer(
+        vertical, second @ directions @ first - first @ directions @ second
+    )
     return jacobian
 
 
@@ -141,21 +139,23 @@ class SetupPrior:
 
 
 def _components(directions: FloatArray, matrix: FloatArray) -> FloatArray:
-    found: FloatArray = np.einsum("ijk,jk->i", directions, matrix) / directions.sum(axis=(1, 2))
+    found: FloatArray = np.einsum("ijk,jk->i", directions, matrix)
     return found
 
 
-def in_main_axes(setup: ImuSetup) -> ImuSetup:
+def in_calibrated_axes(setup: ImuSetup) -> ImuSetup:
     """Return a set-up that takes samples to the same rates and forces of the robot, in the axes defined above."""
-    i, j = other_axes(setup.main_axis)
-    main = np.eye(3)[setup.main_axis]
-    direction = setup.gyro_matrix[:, setup.main_axis]
+    first, second, vertical = _frame(setup.vertical)
+    direction = setup.gyro_matrix @ vertical
     direction = direction / np.linalg.norm(direction)
-    turn = exp_so3(np.cross(main, direction))
-    turn = turn @ exp_so3(np.cross(main, turn.T @ direction))
+    turn = exp_so3(np.cross(vertical, direction))
+    turn = turn @ exp_so3(np.cross(vertical, turn.T @ direction))
     aligned = turn.T @ setup.accelerometer_matrix
-    angle = np.arctan2(aligned[j, i] - aligned[i, j], aligned[i, i] + aligned[j, j])
-    turn = turn @ exp_so3(angle * main)
+    angle = np.arctan2(
+        second @ aligned @ first - first @ aligned @ second,
+        first @ aligned @ first + second @ aligned @ second,
+    )
+    turn = turn @ exp_so3(angle * vertical)
     return replace(
         setup,
         mounting=Mounting(setup.mounting.rotation @ turn, setup.mounting.position),

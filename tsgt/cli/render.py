@@ -62,7 +62,7 @@ def render(kind: str, line: bytes) -> str | None:
 def _hello(hello: HelloRecord) -> str:
     text = f"tsgt {hello.version}, stream protocol {hello.protocol}: {', '.join(hello.capabilities)}"
     if hello.limits is not None:
-        text += f"\nvalid: {hello.limits.promise}{_limits(hello.limits)}"
+        text += f". Valid: {hello.limits.promise}{_limits(hello.limits)}"
     if hello.protocol != PROTOCOL_VERSION:
         text += f" (this program is made for protocol {PROTOCOL_VERSION}; values may be wrong, use a matching tsgt listen)"
     return text

@@ -62,7 +62,9 @@ class Mission(NamedTuple):
     """What a fit takes, and the truth."""
 
     observations: Observations
+    arrival_s: FloatArray  # (M,) of the measurements at the master
     samples: InertialSamples
+    line_arrival_s: FloatArray  # (N,) of each sample's line
     imu: ImuParameters
     centroid_m: FloatArray
     time_s: FloatArray  # (N,) epochs
@@ -102,12 +104,16 @@ def simulated(arguments: argparse.Namespace, seed: int, folder: Path) -> Mission
     first, second, third = ((a, b, c) for a, b, c in known["gyro_matrix"].tolist())
     imu_parameters = replace(imu_parameters, gyro_matrix=(first, second, third))
     origin_ns = int(known["start_ns"])
-    observations, _ = build_observations(loaded.parameters, loaded.measurements, origin_ns=origin_ns)
-    samples = inertial_samples(read_imu_samples(recording), imu_parameters, origin_ns)
+    observations, sources = build_observations(loaded.parameters, loaded.measurements, origin_ns=origin_ns)
+    records = list(read_imu_samples(recording))
+    samples = inertial_samples(records, imu_parameters, origin_ns)
+    arrivals_ns = [record.received_ns for record in records for _ in record.stamp_ns]
     poses = known["poses"]
     return Mission(
         observations,
+        np.array([source.received_ns - origin_ns for source in sources]) / 1e9,
         samples,
+        (np.array(arrivals_ns)[: len(samples)] - origin_ns) / 1e9,
         imu_parameters,
         centroid_m(loaded.parameters),
         known["time_s"],

@@ -82,6 +82,7 @@ CONSISTENT_ALONE = 5
 each of them. A chance agreement of wrong ones within the gate, five times, is none.
 """
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
+UNKNOWN_SIGMA = 100.0  # Of positions in m and rotations in rad, of which nothing is known
 SAMPLES_MARGIN_S = 0.5  # Before the oldest knot: the sample before a knot tells where the next one begins
 
 _DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0], 3)
@@ -195,7 +196,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if self._samples is not None:
             # A trajectory that is lost still predicts.
             from_s = before_s if self._predictor is None else min(before_s, self._predictor.time_s)
-            self._samples = self._samples.select(self._samples.end_s >= from_s - SAMPLES_MARGIN_S)
+            first = int(np.searchsorted(self._samples.end_s, from_s - SAMPLES_MARGIN_S))
+            # The last one, however old: missing ones are filled in from there.
+            self._samples = self._samples.select(slice(max(min(first, len(self._samples) - 1), 0), None))
 
     def predict(self, time_s: float, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all so far, and the (1, 6, 6) covariance of its pose.
@@ -322,6 +325,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
                 self._eliminate(searched, found.knot_index, first, ~held)
             self.residuals_m = self.residuals_m[-len(observations) :]
             self._monitor.set_start(float(observations.time_s[-1]))
+            self._next_search_s = -np.inf
             self._reliable_from_s = _measured_twice_s(observations.select(~outliers))
         else:
             raise GeometryError("the measurements do not determine the trajectory")
@@ -594,11 +598,18 @@ class WindowTrajectory:
     predicted_common: Callable[[float, int], FloatArray]
 
     def at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
-        """Return states of the reference point at N times from the first knot on, and the (N, 6, 6) covariance of poses."""
+        """Return states of the reference point at N times, and the (N, 6, 6) covariance of poses.
+
+        Before the first knot, where nothing is known, the pose is that of the knot, with a covariance that says so.
+        """
         beyond = self._beyond(time_s)
         parts = []
         if not beyond.all() or not len(time_s):
-            parts.append(self.inside.at(time_s[~beyond], dim=dim))
+            first_s = self.inside.knots.time_s[0]
+            states, covariance = self.inside.at(np.maximum(time_s[~beyond], first_s), dim=dim)
+            before = time_s[~beyond] < first_s
+            covariance[before] += UNKNOWN_SIGMA**2 * np.eye(dim)
+            parts.append((replace(states, time_s=time_s[~beyond]), covariance))
         parts += [self.predict(each, dim) for each in time_s[beyond].tolist()]
         if len(parts) == 1:
             return parts[0]
@@ -611,7 +622,8 @@ class WindowTrajectory:
         if self.inside.displacement is None:
             return None
         beyond = self._beyond(time_s)
-        parts = [self.inside.common_at(time_s[~beyond], dim=dim)] if not beyond.all() else []
+        within_s = np.maximum(time_s[~beyond], self.inside.knots.time_s[0])
+        parts = [self.inside.common_at(within_s, dim=dim)] if len(within_s) else []
         parts += [self.predicted_common(each, dim) for each in time_s[beyond].tolist()]
         known = [each for each in parts if each is not None]
         return np.concatenate(known)[_order(beyond)] if known else np.empty((0, dim, dim))

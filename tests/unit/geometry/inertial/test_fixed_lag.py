@@ -274,3 +274,37 @@ def test_common_covariance_equals_that_of_a_displaced_setup() -> None:
         of_trajectory = live.window.trajectory().common_at(np.array([time_s]))
         assert of_trajectory is not None
         np.testing.assert_allclose(of_trajectory, common, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_silent_imu_does_not_break_the_window() -> None:
+    """Samples stop while measurements go on beyond the lag: poses become uncertain, and good again with the samples."""
+    observations = measurements()
+    live = Live()
+    live.measure(observations.select(observations.time_s < 4.0))
+    for row in np.flatnonzero((observations.time_s > 4.0) & (observations.time_s < 8.5)).tolist():
+        now_s = float(observations.time_s[row]) + DELAY_S
+        live.window.update(observations.select(slice(row, row + 1)))
+        live.window.marginalise_before(now_s - LAG_S)
+        if live.window.initialised:
+            assert np.isfinite(live.window.predict(now_s)[1]).all()
+    reasons = [live.window.health]
+    live._sampled = int(np.searchsorted(SAMPLES.end_s, 8.9))
+    live.measure(observations.select(observations.time_s > 8.9))
+    reasons.append(live.window.health)
+    assert reasons[0] is not None
+    assert reasons[1] is None
+    state, _ = live.window.predict(10.9)
+    position, rotation = DRIVE.pose_at(np.array([10.9]))
+    assert live.window.converged
+    assert np.linalg.norm(state.position - position - rotation @ CENTROID) < 0.02
+
+
+def test_time_before_the_first_knot() -> None:
+    """Nothing is known there: no error, and a covariance that says so."""
+    trajectory = tracked().window.trajectory()
+    first_s = float(trajectory.inside.knots.time_s[0])
+    states, covariance = trajectory.at(np.array([first_s - 0.5, first_s + 0.5]))
+    assert states.time_s[0] == first_s - 0.5
+    assert (np.diag(covariance[0]) >= 1e4).all()
+    assert (np.diag(covariance[1]) < 1.0).all()

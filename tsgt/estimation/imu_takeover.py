@@ -33,6 +33,21 @@ SOUND_S = 1.0
 QUARANTINE_S = 4.0
 """How long an IMU that disagreed must have been sound: until the window holds nothing from before."""
 
+CONTRADICTION_S = 0.4
+"""How long measurements may contradict the trajectory with the IMU, and not the one without, until that takes over. A single
+wrong measurement contradicts for no longer: those of the other prisms follow.
+"""
+
+_POSE_DIM = 6
+
+MAX_NIS, MAX_LASTING_NIS = 60.0, 30.0
+"""Squared distance of the poses with IMU from those without, in sigmas of the latter, at once and in two checks half a second
+apart. Six degrees of freedom exceed the second once in 25 000; predictions have longer tails.
+"""
+
+COMPARISON_INTERVAL_S = 0.5
+COMPARED_AGE_S = 1.0  # Of smoothed poses that are compared
+
 _KEPT_BEFORE_START_NS = 5_000_000_000  # of samples, before the first measurement
 
 
@@ -163,7 +178,10 @@ class ImuTakeover:
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
         self._records: deque[ImuSamples] = deque()
-        self._now_s = self._newest_s = self._sound_from_s = -np.inf
+        self._newest_s = self._sound_from_s = self._next_comparison_s = -np.inf
+        self._contradicted_from_s = np.inf
+        self._nis = (0.0, 0.0)  # of the predicted and of a smoothed pose
+        self._contradiction = ""
         self.use = ImuUse.STARTING
         self._disagreement = ""
 
@@ -219,10 +237,13 @@ class ImuTakeover:
 
     def choose(self, now_s: float) -> None:
         """Choose the window for poses that are sent at a time."""
-        self._now_s = now_s
+        if self.use == ImuUse.USED and now_s >= self._next_comparison_s:
+            self._next_comparison_s = now_s + COMPARISON_INTERVAL_S
+            self._compare(now_s)
         found = self._found(now_s)
         if found in _WRONG:
-            self._disagreement = self._untrusted() or str(getattr(self._with, "health", "") or "")
+            self._disagreement = self._untrusted() or self._contradiction
+            self._contradicted_from_s, self._nis, self._contradiction = np.inf, (0.0, 0.0), ""
             self._with = self._create_with()
             self._sound_from_s = now_s + QUARANTINE_S
         elif found == ImuUse.SILENT:
@@ -236,9 +257,6 @@ class ImuTakeover:
     def marginalise_before(self, before_s: float) -> None:
         """Marginalise the states before a time."""
         self._update_without()
-        if self.use == ImuUse.USED and self._without.initialised:
-            # Its covariance follows the errors of its predictions, used or not.
-            self._without.predict(self._now_s)
         self._without.marginalise_before(before_s)
         self._with.marginalise_before(before_s)
 
@@ -247,14 +265,55 @@ class ImuTakeover:
             return ImuUse.WRONG_SETUP
         if now_s - self._newest_s > SILENCE_S:
             return ImuUse.SILENT if np.isfinite(self._newest_s) else ImuUse.STARTING
-        if getattr(self._with, "health", None) is not None:  # a window that judges its IMU
+        if self._contradicted(now_s):
             return ImuUse.DISAGREES
-        return ImuUse.USED if self._with.initialised and self._with.converged else ImuUse.STARTING
+        return ImuUse.USED if self._with.converged else ImuUse.STARTING
+
+    def _contradicted(self, now_s: float) -> bool:
+        """Whether the trajectory without IMU is sound and the one with it, which was, is not."""
+        if self._contradiction:
+            return True
+        if self.use != ImuUse.USED or (self._with.converged and not self._with.ambiguous):
+            self._contradicted_from_s = np.inf
+            return False
+        self._contradicted_from_s = min(self._contradicted_from_s, now_s)
+        if self._with.converged and now_s - self._contradicted_from_s < CONTRADICTION_S:
+            return False
+        self._update_without()
+        if not self._without.converged or self._without.ambiguous:
+            return False
+        self._contradiction = "the measurements of the prisms contradict it"
+        return True
+
+    def _compare(self, now_s: float) -> None:
+        """Compare predicted and smoothed poses of both; the covariance without IMU also follows from such predictions."""
+        self._update_without()
+        if not self._with.converged or not self._without.converged or self._without.ambiguous:
+            return
+        predicted = _nis(
+            *self._with.predict(now_s, dim=_POSE_DIM), *self._without.predict(now_s, dim=_POSE_DIM)
+        )
+        then_s = np.array([now_s - COMPARED_AGE_S])
+        smoothed = 0.0
+        if then_s[0] > max(each.reliable_from_s for each in (self._with, self._without)):
+            both = (each.trajectory().at(then_s, dim=_POSE_DIM) for each in (self._with, self._without))
+            smoothed = _nis(*next(both), *next(both))
+        found = (predicted, smoothed)
+        lasting = (min(pair) for pair in zip(found, self._nis, strict=True))
+        if max(found) > MAX_NIS or max(lasting) > MAX_LASTING_NIS:
+            self._contradiction = f"its poses are {max(found) ** 0.5:.1f} sigmas from those without it"
+        self._nis = found
 
     def _update_without(self) -> None:
         for each in self._waiting:
             self._without.update(each)
         self._waiting.clear()
+
+
+def _nis(state: States, _: FloatArray, other: States, covariance: FloatArray) -> float:
+    """Squared distance of a pose from another, in sigmas of the latter."""
+    error = state.local_coordinates_about(other)[0, :_POSE_DIM]
+    return float(error @ np.linalg.solve(covariance[0], error))
 
 
 def _vector(values: FloatArray | None) -> Vector3 | None:

@@ -23,7 +23,7 @@ def inertial_samples(
     """Return the samples of records as arrays in the order of time.
 
     Samples that follow each other are joined without gap or overlap; those that overlap others otherwise, as after
-    a restart, are dropped. ``origin_ns``: time origin of the observations, on the master's Unix clock.
+    a restart, are dropped, and so are those of a device that repeats itself. ``origin_ns``: time origin of the observations, on the master's Unix clock.
     """
     return SampleConverter(parameters, origin_ns).convert(records)
 
@@ -35,6 +35,7 @@ class SampleConverter:
         self._parameters = parameters
         self._origin_ns = origin_ns
         self._latest_s = self._kept_s = -np.inf
+        self._values = np.full((2, 6), np.nan)  # of the two samples before
 
     def convert(self, records: Iterable[ImuSamples]) -> InertialSamples:
         """Return the samples of further records; those from before earlier ones are dropped."""
@@ -57,11 +58,15 @@ class SampleConverter:
         order = np.argsort(end_s, kind="stable")
         samples = InertialSamples(end_s[order], duration_s[order], rate[order], force[order])
         latest_s = np.maximum.accumulate(np.concatenate([[self._latest_s], samples.end_s]))
-        samples = samples.select(samples.end_s - latest_s[:-1] > _TOUCHING * samples.duration_s)
+        values = np.concatenate([self._values, np.concatenate([rate, force], axis=1)[order]])
+        same = (values[1:] == values[:-1]).all(axis=1)
+        # A device that is asked twice as often as it measures repeats each sample once, a stuck one goes on.
+        stuck = same[1:] & same[:-1]
+        samples = samples.select((samples.end_s - latest_s[:-1] > _TOUCHING * samples.duration_s) & ~stuck)
         between_s = np.diff(samples.end_s, prepend=self._kept_s)
         touching = between_s < (1 + _TOUCHING) * samples.duration_s
         samples.duration_s[touching] = between_s[touching]
-        self._latest_s = float(latest_s[-1])
+        self._latest_s, self._values = float(latest_s[-1]), values[-2:]
         if len(samples):
             self._kept_s = float(samples.end_s[-1])
         return samples

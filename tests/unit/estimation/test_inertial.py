@@ -64,3 +64,11 @@ def test_records_one_by_one_are_the_samples_of_all() -> None:
     assert 0 < len(whole) < sum(len(record.stamp_ns) for record in records)
     for each in fields(InertialSamples):
         np.testing.assert_array_equal(getattr(parts, each.name), getattr(whole, each.name))
+
+
+def test_samples_of_a_stuck_device_are_dropped() -> None:
+    """From the third of the same values on, also across records: they are missing."""
+    stuck = replace(imu_samples(10), angular_rate_radps=((9e-6, 0.0, 0.1),) * 9 + ((0.0, 0.0, 0.1),))
+    converter = SampleConverter(IMU_PARAMETERS, START)
+    counts = [len(converter.convert([record])) for record in (imu_samples(0), stuck, imu_samples(20))]
+    assert counts == [10, 2, 10]

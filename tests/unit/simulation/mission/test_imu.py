@@ -14,6 +14,7 @@ from tsgt.config import ScenarioConfig, SimulatedImu
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.imu_samples import imu_failures
+from tsgt.simulation.faults import FaultKind
 from tsgt.simulation.scenario_files import with_stations
 
 if TYPE_CHECKING:
@@ -120,3 +121,17 @@ def test_mission_with_few_stations(tmp_path: Path, count: int) -> None:
     path = run.master_logs[0].recording()
     assert path is not None
     assert sum(len(record.stamp_ns) for record in read_imu_samples(path)) > 600
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind", ["silence", "stuck", "late-burst", "saturation", "knock", "dropout", "clock-jump"]
+)
+def test_poses_survive_a_fault_of_the_imu(tmp_path: Path, kind: str) -> None:
+    """No valid pose is wrong, most poses are valid, and a replay repeats them."""
+    scenario = WITH.model_copy(update={"pipeline": ScenarioConfig().pipeline})
+    faults = frozenset({FaultKind(f"imu-{kind}")})
+    run = run_mission(tmp_path, scenario, duration_s=40.0, protocol=SUPERFRAME, seed=3, faults=faults)
+    assert check_invariants(run) == []
+    poses = run.master_logs[0].valid_poses()
+    assert np.count_nonzero(poses.series == "predicted") > 0.9 * 20 * 40.0

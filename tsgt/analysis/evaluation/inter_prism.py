@@ -123,7 +123,7 @@ class EpochDistances:
 
 def distances_at_epochs(parameters: Parameters, tracks: Mapping[int, Track]) -> EpochDistances:
     """Interpolate all tracks at 20 Hz and measure the distances; arguments as for :func:`inter_prism`."""
-    layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
+    layout = {p.prism: np.array(p.position_m) for p in parameters.prisms if len(tracks[p.prism])}
     start, end = _common_span([tracks[prism] for prism in layout])
     epochs = np.arange(-(-start // EPOCH_NS), end // EPOCH_NS + 1, dtype=np.int64) * EPOCH_NS
     limit_ns = parameters.pipeline.outage_limit_ns
@@ -145,13 +145,13 @@ def inter_prism(
     stationary_ns: Sequence[tuple[int, int]] | None = None,
     found: EpochDistances | None = None,
 ) -> InterPrismDistances:
-    """Measure the distances between all prisms, moving and stationary; no epochs if the tracks do not overlap in time.
+    """Measure the distances between all measured prisms, moving and stationary; no epochs if the tracks do not overlap in time.
 
-    ``tracks``: one per prism of the layout, in frame ``station1``, none empty. ``stationary_ns``: intervals from another
+    ``tracks``: one per prism of the layout, in frame ``station1``, not all empty. ``stationary_ns``: intervals from another
     source, such as odometry; clipped to the time of the tracks. ``found``: from :func:`distances_at_epochs`, if already
     computed.
     """
-    chosen = [tracks[prism.prism] for prism in parameters.prisms]
+    chosen = [tracks[prism.prism] for prism in parameters.prisms if len(tracks[prism.prism])]
     found = distances_at_epochs(parameters, tracks) if found is None else found
     if stationary_ns is None:
         stationary = stationary_intervals(chosen)

@@ -210,7 +210,9 @@ def collect_findings(
     if unmeasured:
         names = " and ".join(f"prism {prism}" for prism in unmeasured)
         problems["inter_prism"] = f"no usable measurement of {names}"
-    epochs = None if unmeasured else distances_at_epochs(parameters, tracks)
+    elif len(tracks) == 1:
+        problems["inter_prism"] = "the robot has a single prism"
+    epochs = None if "inter_prism" in problems else distances_at_epochs(parameters, tracks)
     distances = None if epochs is None else inter_prism(parameters, tracks, stationary_ns, epochs)
     held_out = None
     if with_held_out and continuous is not None:

@@ -14,6 +14,7 @@ from tsgt.analysis.refinement import refinement_keys
 from tsgt.analysis.report.calibration import calibration_numbers
 from tsgt.analysis.report.diagnosis_section import diagnosis_numbers
 from tsgt.analysis.report.findings import position_sigma_mm, rotation_sigma_deg
+from tsgt.analysis.report.imu_section import imu_numbers
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import nan_median
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
@@ -88,6 +89,8 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
             },
             "outliers": [dataclasses.asdict(outlier) for outlier in f.outliers],
         }
+        if f.continuous.imu is not None:
+            found["imu"] = imu_numbers(f)
     if f.reference_errors:
         found["estimators"] = {name: _compared(f, name) for name in f.reference_errors}
         found |= found["estimators"].get(f.recording.parameters.pipeline.estimator, {})

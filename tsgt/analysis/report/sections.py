@@ -12,6 +12,7 @@ from tsgt.analysis.refinement import refinement_rows, refinement_text
 from tsgt.analysis.report import station_figures as draw
 from tsgt.analysis.report.calibration import calibration_section
 from tsgt.analysis.report.diagnosis_section import diagnosis_section
+from tsgt.analysis.report.imu_section import imu_section
 from tsgt.analysis.report.live_section import live_section
 from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import (
@@ -45,6 +46,7 @@ def sections(f: Findings) -> list[Section]:
         pose_section(f, axis),
         live_section(f.live, f.point),
         estimator_section(f, axis),
+        imu_section(f, axis),
         _distances(f, axis),
         residual_section(f, axis),
         calibration_section(f.recording),

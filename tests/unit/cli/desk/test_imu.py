@@ -11,6 +11,7 @@ from harness.imu_recording import IMU, imu_recording, shaken_drive, write
 from harness.records import HEADER
 
 from tsgt.analysis.formats import write_imu_mounting
+from tsgt.analysis.report import collect_findings, report_numbers, sections
 from tsgt.model import SetupCovariance
 from tsgt.recording import encode_line
 
@@ -90,3 +91,35 @@ def test_evaluate_predicts_held_out_measurements_with_the_imu(tsgt: Tsgt, folder
     found = tsgt("evaluate", folder / "with.jsonl", "--json").json()["held_out_mm"]
     assert set(found) == {"linear", "continuous_imu"}
     assert found["continuous_imu"]["mean"] < 0.5 * found["linear"]["mean"]
+
+
+def test_report_shows_the_imu(tmp_path: Path) -> None:
+    """Rate, biases with sigmas, and the gyro against the prisms; what the samples were made with is found."""
+    path = tmp_path / "field.jsonl"
+    recording = imu_recording(shaken_drive(22.0))
+    write(path, recording)
+    found = collect_findings(recording, path, reference=None, with_held_out=False, refine="off")
+    numbers = report_numbers(found)["imu"]
+    assert numbers["rate_hz"] == pytest.approx(200.0)
+    assert numbers["gaps"] == 0
+    innovation = numbers["rotation_innovation_deg"]
+    assert innovation["rms"] < 1.5 * innovation["expected"]
+    assert max(numbers["gyro_bias_sigma_dps"]) < 0.05
+    (section,) = [each for each in sections(found) if each.title == "IMU of the robot"]
+    assert "stations 1, 2, 3" in section.text[0]
+    section.plots[0].write([tmp_path / "biases.png"])
+    assert (tmp_path / "biases.png").stat().st_size > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stations", [1, 2])
+def test_one_and_two_stations_are_evaluated(tsgt: Tsgt, tmp_path: Path, stations: int) -> None:
+    """Text and report, without distances between three prisms."""
+    path = tmp_path / "field.jsonl"
+    write(path, imu_recording(shaken_drive(22.0), stations=stations))
+    text = tsgt("evaluate", path, "--no-held-out")
+    assert text.code == 0, text.err
+    assert "IMU: used with station" in text.out
+    done = tsgt("evaluate", path, "--no-held-out", "--report", tmp_path / "report")
+    assert done.code == 0, done.err
+    assert "IMU of the robot" in (tmp_path / "report" / "report.html").read_text()

@@ -134,6 +134,11 @@ class InertialWindow(TrajectoryWindow, Protocol):
     """The same with an IMU."""
 
     @property
+    def health(self) -> str | None:
+        """Why the IMU is not to be believed now, for people; None: it is."""
+        ...
+
+    @property
     def biases(self) -> tuple[FloatArray, FloatArray | None] | None:
         """Newest biases of gyro and accelerometer, (3,) each; None where unknown."""
         ...
@@ -270,7 +275,8 @@ class ImuTakeover:
         return ImuUse.USED if self._with.converged else ImuUse.STARTING
 
     def _contradicted(self, now_s: float) -> bool:
-        """Whether the trajectory without IMU is sound and the one with it, which was, is not."""
+        """Whether the IMU is not sound, or the trajectory with it was and is not, while the one without is."""
+        self._contradiction = self._contradiction or self._with.health or ""
         if self._contradiction:
             return True
         if self.use != ImuUse.USED or (self._with.converged and not self._with.ambiguous):

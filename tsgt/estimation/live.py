@@ -57,16 +57,20 @@ class LiveEstimator:
 
     def imu_samples(self, samples: ImuSamples) -> list[ImuSamples | PoseRecord]:
         """Take samples of the IMU at their ``received_ns``, as :meth:`measurement`; return them after the poses due before."""
-        if self._setup is not None:
-            self._setup.samples(samples)
         if not self._with_imu:
+            self._check_setup(samples)
             return [samples]
         if samples.received_ns < self._now_ns:
             samples = dataclasses.replace(samples, received_ns=self._now_ns)
         due = self.advance(samples.received_ns)
         if isinstance(self._estimator, ContinuousEstimator):
             self._estimator.add_samples(samples)
+        self._check_setup(samples)
         return [*due, samples]
+
+    def _check_setup(self, samples: ImuSamples) -> None:
+        if self._setup is not None:
+            self._setup.samples(samples)
 
     def advance(self, now_ns: int) -> list[PoseRecord]:
         """Return the poses that are due by now; call it before another record is published."""

@@ -36,6 +36,7 @@ class FakeInertialSmoother(FixedLagSmoother):
     def __init__(self, _imu: ImuParameters, prior: MotionPrior, **_: Any) -> None:
         super().__init__(prior)
         self.up_m = UP_M
+        self.health: str | None = None
         self.contradicted = False
         self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
         self.samples: list[InertialSamples] = []
@@ -142,7 +143,11 @@ def test_silence_gives_the_poses_without_imu_and_sound_samples_take_it_back(scen
 
 @pytest.mark.parametrize(
     ("wrong", "cause"),
-    [({"up_m": 5.0}, "sigmas from those without"), ({"contradicted": True}, "prisms contradict it")],
+    [
+        ({"up_m": 5.0}, "sigmas from those without"),
+        ({"contradicted": True}, "prisms contradict it"),
+        ({"health": "it is stuck"}, "it is stuck"),
+    ],
 )
 def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any], cause: str) -> None:
     """Until nothing from before is in the window."""

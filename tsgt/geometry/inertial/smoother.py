@@ -39,7 +39,7 @@ FIRST_SEARCH_S, LONGEST_SEARCH_S = 10.0, 80.0
 
 # What an ideal sensor's data sheet leaves out: shaking between the samples, g-sensitivity, temperature.
 GYRO_DENSITY_FACTOR, MIN_GYRO_DENSITY = 2.0, 1.7e-4
-ACCELEROMETER_DENSITY_FACTOR, MIN_ACCELEROMETER_DENSITY = 3.0, 3e-3
+ACCELEROMETER_DENSITY_FACTOR, MIN_ACCELEROMETER_DENSITY = 2.0, 1.2e-3
 BIAS_FACTOR = 2.0
 
 

@@ -51,8 +51,6 @@ from tsgt.analysis.evaluation.metrics import (
 )
 from tsgt.analysis.evaluation.normalised_prediction import (
     NormalisedErrorStatistics,
-    near_loss,
-    normalised_by_axis,
     normalised_prediction_errors,
 )
 from tsgt.analysis.evaluation.reference import (
@@ -116,10 +114,8 @@ __all__ = [
     "inter_prism",
     "interior_mask",
     "interpolation_errors",
-    "near_loss",
     "newest_age_s",
     "noise_scales_by_axis",
-    "normalised_by_axis",
     "normalised_prediction_errors",
     "normalised_residuals",
     "outliers",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from tsgt.analysis.evaluation.normalised_prediction import near_loss, normalised_prediction_errors
+from tsgt.analysis.evaluation.normalised_prediction import normalised_prediction_errors
 from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.smoothing import MIN_PRISMS, estimate_motion_model, recorded_motion_model
 from tsgt.estimation import centroid_m, noise_scales
@@ -206,7 +206,6 @@ def held_out_errors(
     normalised: dict[Predictor, list[FloatArray]] = {"continuous": [], "continuous_imu": []}
     predictors: list[Predictor] = ["continuous"] if complete or imu is None else []
     predictors += [] if imu is None else ["continuous_imu"]
-    near = near_loss(observations.time_s, observations.station)
 
     def fitted(name: Predictor, fold: Fold) -> Trajectory | InertialTrajectory:
         setup, motion = models[fold.number]
@@ -235,7 +234,7 @@ def held_out_errors(
         trajectory = fitted(name, fold)
         test = setup.applied_in_place(observations.select(fold.test))
         normalised[name].append(
-            normalised_prediction_errors(trajectory, scale_noise(test, motion.noise_scales), near[fold.test])
+            normalised_prediction_errors(trajectory, scale_noise(test, motion.noise_scales))
         )
         return trajectory_errors(trajectory, test)
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, start_now
 from tsgt.estimation.linear import LinearEstimator
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,7 +32,11 @@ class LiveEstimator:
     def __init__(self, parameters: Parameters, start_check: StartCheck = start_now) -> None:
         continuous = parameters.pipeline.estimator == "continuous"
         self._with_imu = continuous and parameters.imu is not None
-        self._setup = None if parameters.imu is None else ImuSetupMonitor(parameters, start_check)
+        self._setup = None
+        if (
+            parameters.imu is not None and len(parameters.prisms) >= MIN_PRISMS
+        ):  # fewer do not tell the mounting
+            self._setup = ImuSetupMonitor(parameters, start_check)
         self._estimator = (
             ContinuousEstimator(parameters, self.imu_untrusted) if continuous else LinearEstimator(parameters)
         )

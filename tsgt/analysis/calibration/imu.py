@@ -94,9 +94,12 @@ def calibrate_recorded_imu(
     observations, _ = build_observations(recording.parameters, recording.measurements, origin_ns=origin_ns)
     prisms = len(np.unique(observations.prism))
     if prisms < MIN_PRISMS:
+        undetermined = "two prisms leave the rotation of the IMU about their line undetermined"
+        if prisms == 1:
+            undetermined = "one prism leaves the rotation of the IMU undetermined"
         raise GeometryError(
-            f"{prisms} of the {MIN_PRISMS} prisms that show how the robot turns were measured: calibrate once with "
-            f"{MIN_PRISMS} stations; the mounting stays valid with fewer, while IMU and prisms stay on the robot"
+            f"{undetermined}: calibrate once with {MIN_PRISMS} stations; the mounting stays valid with fewer, while IMU and "
+            "prisms stay on the robot"
         )
     found = calibrate_imu(
         observations, samples, configured.noise, Gravity.of(configured), on_progress=on_progress

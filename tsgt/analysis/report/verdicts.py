@@ -172,7 +172,9 @@ def _times(f: Findings) -> Iterator[Verdict]:
 
 def _distances(f: Findings) -> Iterator[Verdict]:
     if f.inter_prism is None:
-        yield Verdict(Level.BAD, f"No inter-prism distances: {f.problems['inter_prism']}.")
+        single = len(f.recording.parameters.prisms) == 1
+        level = Level.CARE if single else Level.BAD
+        yield Verdict(level, f"No inter-prism distances: {f.problems['inter_prism']}.")
         return
     static = [pair.statistics() for pair in f.inter_prism.static if len(pair.distances_m)]
     moving = [pair.statistics() for pair in f.inter_prism.dynamic if len(pair.distances_m)]

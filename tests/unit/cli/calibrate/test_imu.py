@@ -125,4 +125,7 @@ def test_two_prisms_do_not_calibrate(tsgt: Tsgt, recording: Path, tmp_path: Path
     path.write_bytes(b"".join(line for line in lines if b'"point","station":3' not in line))
     done = tsgt("calibrate", "imu", path)
     assert done.code == 1
-    assert "2 of the 3 prisms that show how the robot turns were measured: calibrate once with 3" in done.err
+    assert (
+        "two prisms leave the rotation of the IMU about their line undetermined: calibrate once with 3"
+        in done.err
+    )

@@ -96,7 +96,7 @@ def monitored(parameters: Parameters, arrivals: Sequence[Measurement | ImuSample
 
 def mission(folder: Path, model: str, seed: int, found: dict[str, list[tuple[float | None, int]]]) -> str:
     """Monitor one mission with each error and with none; add times and other events, return the events of a right set-up."""
-    path = recorded_mission(folder, model, seed, 300.0).path
+    path = recorded_mission(folder, model, seed, 300.0)
     recording = load_recording(path)
     parameters = recording.parameters
     assert parameters.imu is not None  # noqa: S101 (each mission has one)

@@ -26,7 +26,7 @@ from tsgt.geometry.inertial_calibration.joint_solver import (
     without_tilt,
 )
 from tsgt.geometry.inertial_calibration.joint_system import assemble_border, assemble_states, stamp_times
-from tsgt.geometry.inertial_calibration.setup import MOUNTING_DIM, ImuSetup, SetupPrior
+from tsgt.geometry.inertial_calibration.setup import MOUNTING_DIM, ROTATION, ImuSetup, SetupPrior
 from tsgt.geometry.motion_calibration.timestamp_drift import SegmentInformation, birge_ratio
 from tsgt.geometry.trajectory.block_tridiagonal import factorise
 
@@ -145,12 +145,14 @@ def _judged(solution: JointSolution, alignment: Alignment, log_bayes_factor: flo
     information = np.linalg.inv(solution.factor.shared_covariance) - np.diag(sigmas**-2.0)
     covariance = np.linalg.inv(information / ratio**2 + np.diag(sigmas**-2.0))[TILT_DIM:, TILT_DIM:]
     deviation = solution.equations.deviation / sigmas
-    difference, variances = np.zeros(len(sigmas)), np.zeros(len(sigmas))
+    difference, uncertainty = np.zeros(len(sigmas)), np.zeros((len(sigmas), len(sigmas)))
     for sign, half in ((1.0, segments[: len(segments) // 2]), (-1.0, segments[len(segments) // 2 :])):
         own = np.linalg.inv(np.diag(sigmas**-2.0) + sum(each.information for each in half))
         difference -= sign * (own @ (deviation + sum(each.gradient for each in half)))
-        variances += np.diag(own)
+        uncertainty += own
     of_setup = slice(TILT_DIM, TILT_DIM + MOUNTING_DIM)
+    difference, uncertainty = difference[of_setup], uncertainty[of_setup, of_setup]
+    covariance[ROTATION, ROTATION] += variation(difference[ROTATION], uncertainty[ROTATION, ROTATION])
     states = solution.equations.states
     used = states.weights > 0
     # The median of a chi-square distribution with three degrees of freedom is 2.366.
@@ -163,13 +165,25 @@ def _judged(solution: JointSolution, alignment: Alignment, log_bayes_factor: flo
         float(problem.prior.sigmas[MOUNTING_DIM]),
         log_bayes_factor,
         ratio,
-        difference[of_setup],
-        np.sqrt(variances[of_setup]),
+        difference,
+        np.sqrt(np.diag(uncertainty)),
         noise_scale,
         len(problem.observations),
         int(np.count_nonzero(states.weights < 1.0)),
         float(np.ptp(problem.observations.time_s)),
     )
+
+
+def variation(difference: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(3, 3) covariance of a rotation at any time of a drive, during which it changes, beside that of its mean.
+
+    The scale factors of a gyro change with its temperature, and so do its axes. ``difference``: (3,) of the halves, with
+    its covariance by noise. A uniform change by d from half to half has the variance d^2 / 3; no change is assumed unless
+    noise explains half of the square at most.
+    """
+    squares = float(difference @ np.linalg.solve(covariance, difference))
+    share = max(0.0, 1.0 - 2.0 * len(difference) / max(squares, 1e-12))
+    return share * np.outer(difference, difference) / 3.0
 
 
 def segment_information(solution: JointSolution) -> list[SegmentInformation]:

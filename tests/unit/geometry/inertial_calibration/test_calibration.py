@@ -10,6 +10,7 @@ from harness.imu_calibration import UncalibratedDrive, uncalibrated_drive
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.inertial_calibration import ImuCalibration, calibrate_imu
+from tsgt.geometry.inertial_calibration.calibration import variation
 from tsgt.geometry.inertial_calibration.setup import ACCELEROMETER_MATRIX, DELAYS, GYRO_MATRIX
 
 DEG = np.pi / 180
@@ -58,6 +59,15 @@ def test_drive_agrees_with_itself(found: ImuCalibration) -> None:
     assert found.birge_ratio < 1.5
     assert 0.7 < found.noise_scale < 1.3
     assert (np.abs(found.halves) < 4 * found.halves_sigmas).all()
+
+
+def test_variation_of_a_rotation() -> None:
+    """What changes uniformly during a drive is uncertain by the spread of its values; noise is no change."""
+    covariance = np.diag([1e-8, 1e-8, 1e-6])
+    values = np.linspace(-1.0, 1.0, 1001)[:, None] * [0.01, 0.0, 0.0]
+    difference = values[:500].mean(axis=0) - values[501:].mean(axis=0)
+    np.testing.assert_allclose(variation(difference, covariance), np.cov(values.T), rtol=0.02, atol=1e-12)
+    assert not variation(np.array([1e-4, -1e-4, 1.5e-3]), covariance).any()
 
 
 def test_short_drive_is_an_error(drive: UncalibratedDrive) -> None:

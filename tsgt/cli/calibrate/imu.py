@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -9,11 +10,20 @@ import numpy as np
 
 from tsgt.analysis.calibration import calibrate_recorded_imu
 from tsgt.analysis.formats import write_imu_mounting
-from tsgt.cli.options import OutputFile, json_option, keep_going_option, recording_argument
+from tsgt.cli.options import (
+    FiniteRange,
+    OutputFile,
+    json_option,
+    keep_going_option,
+    path_type,
+    recording_argument,
+)
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
 from tsgt.cli.progress import progress
+from tsgt.config import IMU_NOISE
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial_calibration import setup_components
+from tsgt.model import ImuParameters
 from tsgt.recording import load_recording, read_imu_samples
 
 if TYPE_CHECKING:
@@ -21,7 +31,6 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.calibration import CalibratedImu
     from tsgt.geometry import FloatArray
-    from tsgt.model import ImuParameters
 
 
 @click.command()
@@ -29,21 +38,59 @@ if TYPE_CHECKING:
 @click.option(
     "--output", type=OutputFile(".toml"), help="File of mounting, latency and gyro matrix to write (.toml)."
 )
+@click.option(
+    "--imu",
+    "samples",
+    type=path_type,
+    help="Samples of the robot's IMU (tsgt import imu), instead of recorded ones.",
+)
+@click.option(
+    "--noise",
+    type=click.Choice(list(IMU_NOISE)),
+    help="Class of the IMU, for a recording of a master without it.",
+)
+@click.option(
+    "--gravity-mps2",
+    type=FiniteRange(9.7, 9.9),
+    help="Gravity where the robot drove, for a recording of a master without the IMU.",
+)
 @keep_going_option
 @json_option
-def imu(*, recording: Path, output: Path | None, keep_going: bool, as_json: bool) -> int:
+def imu(
+    *,
+    recording: Path,
+    output: Path | None,
+    samples: Path | None,
+    noise: str | None,
+    gravity_mps2: float | None,
+    keep_going: bool,
+    as_json: bool,
+) -> int:
     """Calibrate the robot's IMU from motion.
 
     Finds mounting, position, latency and gyro matrix from two to five minutes of driving curves, slopes and bumps,
     without an initial guess. What the drive leaves undetermined is named. Exit code 3: the parts of the drive
     contradict each other, or the measurements the samples; the file is not written.
     """
-    refuse_overwrite([recording], output)
+    refuse_overwrite([recording, samples], output)
+    loaded = load_recording(recording, keep_going=keep_going, on_problem=report_problem)
+    if noise is not None or gravity_mps2 is not None:
+        if noise is None or gravity_mps2 is None:
+            raise click.UsageError("--noise and --gravity-mps2 belong together")
+        if loaded.parameters.imu is not None:
+            raise click.UsageError(f"--noise: {recording} has the parameters of an IMU")
+        unknown = ImuParameters(
+            position_m=(0.0, 0.0, 0.0),
+            orientation_xyzw=(0.0, 0.0, 0.0, 1.0),
+            noise=IMU_NOISE[noise],
+            gravity_mps2=gravity_mps2,
+        )
+        loaded = replace(loaded, parameters=replace(loaded.parameters, imu=unknown))
     with progress("calibrating") as on_progress:
         found = calibrate_recorded_imu(
-            load_recording(recording, keep_going=keep_going, on_problem=report_problem),
-            # Problems of the file have been reported.
-            read_imu_samples(recording, keep_going=keep_going),
+            loaded,
+            # Problems of the recording have been reported.
+            read_imu_samples(samples or recording, keep_going=keep_going),
             on_progress=on_progress,
         )
     if as_json:

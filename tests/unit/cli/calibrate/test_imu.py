@@ -10,10 +10,10 @@ import pytest
 from harness.imu_calibration import UncalibratedDrive, uncalibrated_drive, write_imu_recording
 
 from tsgt.analysis.calibration import calibrate_recorded_imu
-from tsgt.config import load_imu_mounting
+from tsgt.config import IMU_NOISE, load_imu_mounting
 from tsgt.errors import GeometryError
 from tsgt.geometry import log_so3, rotation_from_quaternion
-from tsgt.recording import load_recording, read_imu_samples
+from tsgt.recording import encode_line, load_recording, read_imu_samples
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -129,3 +129,23 @@ def test_two_prisms_do_not_calibrate(tsgt: Tsgt, recording: Path, tmp_path: Path
         "two prisms leave the rotation of the IMU about their line undetermined: calibrate once with 3"
         in done.err
     )
+
+
+def test_imported_samples_are_calibrated(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """Of a recording that knows no IMU; class and gravity go into the file, which then describes the IMU completely."""
+    lines = recording.read_bytes().splitlines(keepends=True)
+    samples, rest = (
+        [line for line in lines if line.startswith(b'{"type":"imu"') == wanted] for wanted in (True, False)
+    )
+    loaded = load_recording(recording).parameters
+    bare, imported, output = tmp_path / "bare.jsonl", tmp_path / "imu.jsonl", tmp_path / "imu.toml"
+    parameters = encode_line(replace(loaded, imu=None)) + b"\n"
+    bare.write_bytes(b"".join([rest[0], parameters, *rest[2:]]))
+    imported.write_bytes(b"".join([lines[0], *samples]))
+    assert tsgt("calibrate", "imu", bare, "--imu", imported, "--noise", "industrial").code == 2
+    given = ("--imu", imported, "--noise", "industrial", "--gravity-mps2", "9.81", "--output", output)
+    assert tsgt("calibrate", "imu", bare, *given).code == 0
+    known = load_imu_mounting(output).parameters()
+    assert known is not None
+    assert known.gravity_mps2 == 9.81
+    assert known.noise == IMU_NOISE["industrial"]

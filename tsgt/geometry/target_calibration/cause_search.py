@@ -25,8 +25,8 @@ BLOCK = 4  # Columns of a cause, at most
 MIN_REDUNDANCY = (
     1e-6  # Share of a column that least squares leaves in the residuals; below, it has no effect on them
 )
-AMBIGUITY = 9.2
-"""Difference of twice the log-likelihood below which an alternative is not excluded: a likelihood ratio of 100."""
+AMBIGUITY = 6.0
+"""Difference of the cost below which an alternative is not excluded: a ratio of 20 of the probabilities."""
 
 
 def exchanged(chosen: Subset, old: Subset, new: Subset) -> Subset:
@@ -137,32 +137,22 @@ class CauseSearch:
             chosen, cost = improved
 
     def alternatives(self, chosen: Subset) -> list[tuple[Subset, Subset]]:
-        """Return which of the chosen causes others may replace that explain nearly as well.
+        """Return which of the chosen causes others may replace that explain nearly as well, the best first.
 
-        One by one, whatever their penalties; one by two of a group and two of a group by one, which have other numbers of
-        unknowns, with them.
+        One by one, one by two of a group, and two of a group by one.
         """
         others = [cause for cause in range(self._count) if cause not in chosen]
-        single = [((cause,), (other,)) for cause in chosen for other in others]
-        more: list[tuple[Subset, Subset]] = [
-            ((cause,), pair) for cause in chosen for pair in self._pairs if not {*pair} & {*chosen}
+        exchanges: list[list[tuple[Subset, Subset]]] = [
+            [((cause,), (other,)) for cause in chosen for other in others],
+            [((cause,), pair) for cause in chosen for pair in self._pairs if not {*pair} & {*chosen}],
+            [(pair, (other,)) for pair in self._pairs if {*pair} <= {*chosen} for other in others],
         ]
-        fewer: list[tuple[Subset, Subset]] = [
-            (pair, (other,)) for pair in self._pairs if {*pair} <= {*chosen} for other in others
-        ]
-        found: list[tuple[Subset, Subset]] = []
-        for exchanges, cost in ((single, self._likelihoods), (more, self.costs), (fewer, self.costs)):
-            if exchanges:
-                limit = cost([chosen])[0] + AMBIGUITY
-                values = cost([exchanged(chosen, *each) for each in exchanges])
-                found += [each for each, value in zip(exchanges, values, strict=True) if value < limit]
-        return found
-
-    def _likelihoods(self, subsets: Sequence[Subset]) -> FloatArray:
-        """Twice the negative logarithm of likelihood and odds of subsets of one size, (s,)."""
-        index = np.array(subsets, dtype=np.intp)
-        likelihoods: FloatArray = self.misfits(index) + self._odds_of(index)
-        return likelihoods
+        limit = float(self.costs([chosen])[0]) + AMBIGUITY
+        found: list[tuple[float, tuple[Subset, Subset]]] = []
+        for some in filter(None, exchanges):
+            costs = self.costs([exchanged(chosen, *each) for each in some]).tolist()
+            found += [(cost, each) for cost, each in zip(costs, some, strict=True) if cost < limit]
+        return [each for _, each in sorted(found)]
 
     def _blocks(self, index: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
         """Return normal matrices (s, b, b) and right-hand sides (s, b, 1) of subsets (s, k)."""

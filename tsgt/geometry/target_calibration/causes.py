@@ -60,7 +60,7 @@ PENALTIES: dict[CauseKind, float] = {
     CauseKind.TARGET_CONSTANT: 8.0,
     CauseKind.SIGHT: 12.0,
     CauseKind.TRIPOD: 16.0,
-    CauseKind.TILT: 16.0,
+    CauseKind.TILT: 8.0,
 }
 """By how much the unknowns of a cause must lower twice the negative log-likelihood, beside the odds: four for each unknown, as many
 causes are tried, and eight at least."""
@@ -179,17 +179,10 @@ def _selected(readings: TargetReadings, linear: Linearisation, rules: SelectionR
             break
         candidates = [each for row, each in enumerate(candidates) if row not in implausible]
     alternatives = search.alternatives(chosen)
-    # Of causes that the readings do not tell apart: a tilt fails a check, where an instrument error would be applied; wrong
-    # sights are more frequent than tripods that move.
-    preferred = {CauseKind.INSTRUMENT: CauseKind.TILT, CauseKind.TRIPOD: CauseKind.SIGHT}
-    preferable = {
-        old[0]: new[0]
-        for old, new in reversed(alternatives)
-        if len(old) == len(new) and causes[new[0]].kind is preferred.get(causes[old[0]].kind)
-    }
-    preferable_chosen = tuple(preferable.get(row, row) for row in chosen)
-    if preferable_chosen != chosen and len(set(preferable_chosen)) == len(chosen):
-        chosen, values = preferable_chosen, search.estimates(preferable_chosen)
+    preferable = next((each for each in alternatives if _is_preferable(readings, causes, *each)), None)
+    if preferable is not None:
+        chosen = exchanged(chosen, *preferable)
+        values = search.estimates(chosen)
         alternatives = search.alternatives(chosen)
 
     def is_possible(old: Subset, new: Subset) -> bool:
@@ -215,6 +208,25 @@ def _selected(readings: TargetReadings, linear: Linearisation, rules: SelectionR
     misfit = float(search.misfits(np.array([chosen], np.intp))[0])
     freedom = linear.redundancy - sum(int(ends[row + 1] - ends[row]) for row in chosen)
     return _Selection(found, float(search.costs([chosen])[0]), math.sqrt(misfit / max(freedom, 1)))
+
+
+def _is_preferable(readings: TargetReadings, causes: Sequence[Cause], old: Subset, new: Subset) -> bool:
+    """Whether one chosen cause is better replaced by others that the readings do not tell from it.
+
+    By a tilt an instrument error, as a tilt fails a check where the error would be applied. A tripod that moved by wrong sights, which
+    are more frequent; of two sights those measured before it moved, without which the frame is right either way.
+    """
+    (cause, *more), others = [causes[row] for row in old], [causes[row] for row in new]
+    if more:
+        return False
+    if cause.kind is CauseKind.INSTRUMENT:
+        return [other.kind for other in others] == [CauseKind.TILT]
+    if cause.kind is not CauseKind.TRIPOD or any(
+        other.kind is not CauseKind.SIGHT or other.station != cause.station for other in others
+    ):
+        return False
+    own = readings.target[readings.station == cause.station].tolist()
+    return len(others) == 1 or all(own.index(other.target) < own.index(cause.target) for other in others)
 
 
 _Candidate = tuple[Cause, "FloatArray", float]  # Cause, columns (n, 3, c), penalty

@@ -3,8 +3,9 @@
 Simulated campaigns: three stations within 8 m, 8 to 14 targets at 10 to 150 m, one face; the errors of one kind each, all
 other instrument errors drawn from the data sheet. A cause is named if a note names it: a rejected sight, an instrument error that surely exceeds
 three sigmas of the data sheet, a tripod that moved, noise larger than stated. NEES is that of all frames together, over its degrees of freedom.
+A second table: what the note on a rejected target says, where it moved between the rounds or a station erred.
 
-    python benchmarks/run.py target_calibration [SEEDS]
+    python benchmarks/run.py target_calibration [SEEDS] [rejected]
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from harness.target_field import TargetField, frame_nees
 from scipy.special import chdtri
 
+from tsgt.analysis.calibration import TargetCalibration, target_notes
 from tsgt.geometry.target_calibration import (
     DATA_SHEET_SIGMA,
     CauseKind,
@@ -25,7 +27,7 @@ from tsgt.geometry.target_calibration import (
     calibrate_network,
     checks,
 )
-from tsgt.model import TARGET_NOISE
+from tsgt.model import TARGET_NOISE, SetupCovariance
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -39,8 +41,16 @@ VERDICTS = ("exactly", "and more", "in part", "another", "nothing")
 
 
 def main() -> None:
-    """Print one row per kind of error."""
+    """Print one row per kind of error, and one per fate of a rejected target."""
     seeds = int(sys.argv[1]) if len(sys.argv) > 1 else SEEDS
+    if sys.argv[2:] != ["rejected"]:
+        print_causes(seeds)
+        print()
+    print_rejected(seeds)
+
+
+def print_causes(seeds: int) -> None:
+    """Print what is named, and how good the frames are."""
     header = ["error", *VERDICTS, "exit code 3", "frames within 95 %", "NEES"]
     print(f"| {' | '.join(header)} |\n|{'---|' * len(header)}")
     for name, (changes, truth) in kinds().items():
@@ -64,6 +74,66 @@ def main() -> None:
             f"| {name} | {' | '.join(counts)} | {failed} | {inside} of {seeds} | {np.mean(nees):.2f} |",
             flush=True,
         )
+
+
+def print_rejected(seeds: int) -> None:
+    """Print what the note on a rejected target says."""
+    print("| target 1 | moved | erred | not told | not rejected |\n|---|---|---|---|---|")
+    for name, (change, station, size_m) in REJECTED.items():
+        counts = Counter(said(change, station, size_m, np.random.default_rng(seed)) for seed in range(seeds))
+        print(
+            f"| {name} | {counts['moved']} | {counts['erred']} | {counts['not told']} | {counts['']} |",
+            flush=True,
+        )
+
+
+REJECTED = {
+    "moved by 15 mm after station 1": ("moved", 0, 0.015),
+    "moved by 15 mm before station 3": ("moved", 2, 0.015),
+    "moved by 50 mm after station 1": ("moved", 0, 0.050),
+    "moved by 15 mm horizontally after station 1": ("level", 0, 0.015),
+    "moved by 50 mm horizontally before station 3": ("level", 2, 0.050),
+    "distance of station 1 wrong by 15 mm": ("along", 0, 0.015),
+    "distance of station 1 wrong by 50 mm": ("along", 0, 0.050),
+    "horizontal angle of station 3 wrong by 15 mm": ("across", 2, 0.015),
+    "horizontal angle of station 3 wrong by 50 mm": ("across", 2, 0.050),
+    "vertical angle of station 1 wrong by 50 mm": ("up", 0, 0.050),
+    "station 1 aimed 30 mm beside": ("beside", 0, 0.030),
+    "station 2 aimed 30 mm beside": ("beside", 1, 0.030),
+}
+"""What happened to target 1, which station's measurement differs from the two others', and the size in m."""
+
+
+def said(change: str, station: int, size_m: float, rng: np.random.Generator) -> str:
+    """Say what the note on the rejected target names."""
+    field = TargetField(rng=rng, targets=int(rng.integers(8, 15)), in_specification=True)
+    line = field.points_m[0] - field.translation_m[station]
+    along = line / np.linalg.norm(line)
+    across = np.array([-line[1], line[0], 0.0]) / np.hypot(line[0], line[1])
+    up = np.cross(along, across)
+    angle = rng.uniform(0, 2 * np.pi)
+    direction = {
+        "moved": off(rng) / 0.015,
+        "level": np.array([np.cos(angle), np.sin(angle), 0.0]),
+        "along": along,
+        "across": across,
+        "up": up,
+        "beside": np.cos(angle) * across + np.sin(angle) * up,
+    }[change]
+    field.displaced = {(station, 0): size_m * direction}
+    network = calibrate_network(field.measure(), TARGET_NOISE)
+    solved = TargetCalibration(network, {}, SetupCovariance(components=(), matrix=()), applied=True)
+    notes = [note for note in target_notes(solved) if "target 1 rejected" in note]
+    if not notes:
+        return ""
+    for words, verdict in (
+        ("cannot be told", "not told"),
+        ("do not tell", "not told"),
+        ("the station erred", "erred"),
+    ):
+        if words in notes[0]:
+            return verdict
+    return "moved"
 
 
 def kinds() -> dict[str, tuple[Callable[[np.random.Generator], dict[str, Any]], set[Cause]]]:

@@ -4,21 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from tsgt.analysis.calibration.rejected_targets import listed, numbers, rejection_notes
 from tsgt.geometry.target_calibration import DATA_SHEET_SIGMA, CauseKind, InstrumentError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from tsgt.analysis.calibration.targets import TargetCalibration
-    from tsgt.geometry import FloatArray
     from tsgt.geometry.target_calibration import Cause, FitQuality
 
 NOISE_LEVEL = 1e-3  # Probability by chance of a misfit that is called noise larger than stated
 SPEC_FACTOR = 3.0  # Data sheet's sigmas that an instrument error surely exceeds if it is reported as one
-DOMINANT = 0.95  # Share of a displacement's length in one direction that makes it an error of one reading
-CONFUSED_M = 0.02  # Distance from another target's place below which the numbers were confused
 UNEVEN = 1.3  # Ratio of noise scales beyond which the largest is named
 
 _NAMES = {
@@ -38,7 +32,7 @@ _REPAIRS = {
 def target_notes(calibration: TargetCalibration) -> list[str]:
     """Return one sentence per finding, the most important first."""
     network = calibration.network
-    notes = _rejected(calibration)
+    notes = rejection_notes(calibration)
     notes += [
         _excess_text(calibration, cause)
         for cause in network.causes
@@ -82,7 +76,7 @@ def suspect_exclusions(calibration: TargetCalibration) -> list[str]:
 
 def exclusion(calibration: TargetCalibration, cause: Cause) -> str:
     """Return the value of ``--exclude`` for a sight."""
-    station, target = _numbers(calibration, cause)
+    station, target = numbers(calibration, cause)
     return f"{target}" if cause.either_station else f"{station}:{target}"
 
 
@@ -92,61 +86,6 @@ def unidentified_text(calibration: TargetCalibration) -> str:
         " or ".join(dict.fromkeys(_name(calibration, each) for each in (cause, *cause.alternatives)))
         for cause in calibration.network.unidentified
     )
-
-
-def _rejected(calibration: TargetCalibration) -> list[str]:
-    sights = [cause for cause in calibration.network.causes if cause.kind is CauseKind.SIGHT]
-    notes = []
-    for cause in sights:
-        same = [other for other in sights if other.target == cause.target]
-        station, target = _numbers(calibration, cause)
-        if len(same) > 1:
-            if cause is same[0]:
-                notes.append(
-                    f"target {target} rejected: no two stations agree on its place; it moved between the rounds, or its "
-                    "number was given to several targets; measure it again with all stations"
-                )
-            continue
-        size = f"{1e3 * cause.size_m:.1f} mm"
-        if cause.either_station:
-            notes.append(
-                f"target {target} rejected: stations {_listed(_stations_of(calibration, cause))} disagree on its place by {size}, and "
-                f"no other station measured it{_confused(calibration, cause)}; measure it again"
-            )
-            continue
-        others = [s for s in _stations_of(calibration, cause) if s != station]
-        notes.append(
-            f"station {station}: target {target} rejected: {size} from the place on which stations "
-            f"{_listed(others)} agree ({_components_text(calibration, cause)}): {_verdict(calibration, cause)}; "
-            "measure it again"
-        )
-    return notes
-
-
-def _verdict(calibration: TargetCalibration, cause: Cause) -> str:
-    """Say whether one reading is wrong or the target has moved."""
-    if confused := _confused(calibration, cause):
-        return confused.removeprefix(", ")
-    shares = np.abs(_components(calibration, cause)) / cause.size_m
-    readings = ("distance", "horizontal angle", "vertical angle")
-    for share, reading in zip(shares, readings, strict=True):
-        if share > DOMINANT:
-            return f"the station erred, its {reading} is wrong"
-    return "the target moved between these measurements, or another point was aimed at"
-
-
-def _confused(calibration: TargetCalibration, cause: Cause) -> str:
-    network = calibration.network
-    assert cause.value is not None  # noqa: S101 (selected)
-    assert cause.target is not None  # noqa: S101 (of a sight)
-    points = network.network.points_m
-    # A place that a station measured wrong differs by the displacement, with the sign of the sight.
-    distances = np.linalg.norm(points - (points[cause.target] + cause.value), axis=1)
-    distances[cause.target] = np.inf
-    nearest = int(np.argmin(distances))
-    if distances[nearest] > CONFUSED_M:
-        return ""
-    return f", this is the place of target {network.readings.targets[nearest]}"
 
 
 def _excess_text(calibration: TargetCalibration, cause: Cause) -> str:
@@ -161,7 +100,7 @@ def _excess_text(calibration: TargetCalibration, cause: Cause) -> str:
             if other.kind is CauseKind.INSTRUMENT and other.error is cause.error
         }
     )
-    which = f"station {station}" if not others else f"station {station} or {_listed(others, 'or')}"
+    which = f"station {station}" if not others else f"station {station} or {listed(others, 'or')}"
     if not calibration.applied:
         done = "not applied with --weights none"
     elif cause.error is InstrumentError.RANGE_CONSTANT:
@@ -176,11 +115,15 @@ def _excess_text(calibration: TargetCalibration, cause: Cause) -> str:
 
 def _tripod_text(calibration: TargetCalibration, cause: Cause) -> str:
     assert cause.value is not None  # noqa: S101 (selected)
-    station, target = _numbers(calibration, cause)
+    station, target = numbers(calibration, cause)
     before = _before(calibration, cause)
+    sights = [_sight(calibration, each) for each in cause.alternatives if each.kind is CauseKind.SIGHT]
+    instead = (
+        f" (nearly as likely: {' and '.join(sights)} wrong; measure these again to decide)" if sights else ""
+    )
     return (
         f"station {station}: the tripod looks moved by {1e3 * cause.size_m:.1f} mm and turned by "
-        f"{1e3 * abs(float(cause.value[3])):.2f} mrad before target {target} was measured; measure the targets before it "
+        f"{1e3 * abs(float(cause.value[3])):.2f} mrad before target {target} was measured{instead}; measure the targets before it "
         f"again, or leave them out: --exclude {','.join(f'{station}:{each}' for each in before)}"
     )
 
@@ -237,41 +180,5 @@ def _name(calibration: TargetCalibration, cause: Cause) -> str:
 
 
 def _sight(calibration: TargetCalibration, cause: Cause) -> str:
-    station, target = _numbers(calibration, cause)
+    station, target = numbers(calibration, cause)
     return f"target {target}" if cause.either_station else f"target {target} of station {station}"
-
-
-def _numbers(calibration: TargetCalibration, cause: Cause) -> tuple[int, int]:
-    readings = calibration.network.readings
-    assert cause.target is not None  # noqa: S101 (of a sight or a tripod)
-    return readings.stations[cause.station], readings.targets[cause.target]
-
-
-def _stations_of(calibration: TargetCalibration, cause: Cause) -> list[int]:
-    """Numbers of the stations that measured the cause's target."""
-    readings = calibration.network.readings
-    rows = sorted(set(readings.station[readings.target == cause.target].tolist()))
-    return [readings.stations[row] for row in rows]
-
-
-def _components(calibration: TargetCalibration, cause: Cause) -> FloatArray:
-    """(3,) displacement of a sight along, clockwise and upwards across the line of sight."""
-    network = calibration.network.network
-    assert cause.value is not None  # noqa: S101 (selected)
-    line = network.points_m[cause.target] - network.translation_m[cause.station]
-    along = line / np.linalg.norm(line)
-    across = np.cross(along, [0.0, 0.0, 1.0])
-    across /= max(float(np.linalg.norm(across)), 1e-9)
-    axes = np.stack([along, across, np.cross(across, along)])
-    components: FloatArray = axes @ cause.value
-    return components
-
-
-def _components_text(calibration: TargetCalibration, cause: Cause) -> str:
-    along, across, up = 1e3 * _components(calibration, cause)
-    return f"along the line of sight {along:+.1f}, clockwise {across:+.1f}, up {up:+.1f} mm"
-
-
-def _listed(numbers: Sequence[int], word: str = "and") -> str:
-    *most, last = map(str, numbers)
-    return f"{', '.join(most)} {word} {last}" if most else last

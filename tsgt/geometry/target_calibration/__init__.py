@@ -28,6 +28,7 @@ from tsgt.geometry.target_calibration.prisms import (
     WeakAxis,
     calibrate_prisms,
 )
+from tsgt.geometry.target_calibration.sights import AIM, MOVED, READINGS, SightError, sight_error
 from tsgt.geometry.target_calibration.station_frames import (
     CONSISTENCY,
     WEAK_STATION_RAD,
@@ -38,11 +39,14 @@ from tsgt.geometry.target_calibration.station_frames import (
 )
 
 __all__ = [
+    "AIM",
     "CONSISTENCY",
     "DATA_SHEET_SIGMA",
     "ERRORS",
     "FALSE_ALARM_RATE",
     "MIN_POINTS",
+    "MOVED",
+    "READINGS",
     "WEAK_BODY_RAD",
     "WEAK_STATION_RAD",
     "Cause",
@@ -59,6 +63,7 @@ __all__ = [
     "PointPairs",
     "PointSet",
     "PrismCalibration",
+    "SightError",
     "TargetReadings",
     "WeakAxis",
     "calibrate_network",
@@ -66,6 +71,7 @@ __all__ = [
     "checks",
     "fit_frame",
     "rejected_targets",
+    "sight_error",
     "station_frames",
     "unweighted_frames",
 ]

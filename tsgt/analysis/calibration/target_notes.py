@@ -62,16 +62,24 @@ def target_notes(calibration: TargetCalibration) -> list[str]:
 
 
 def suspect_exclusions(calibration: TargetCalibration) -> list[str]:
-    """Return what ``--exclude`` would leave out: sights that are suspect, or not told apart from another cause."""
+    """Return what ``--exclude`` would leave out: what a tripod that moved measured before, and suspect sights.
+
+    Suspect are also those that are not told apart from another cause.
+    """
     network = calibration.network
-    unidentified = [
-        each
-        for cause in network.unidentified
-        for each in (cause, *cause.alternatives)
-        if each.kind is CauseKind.SIGHT
+    outdated = [
+        f"{numbers(calibration, cause)[0]}:{target}"
+        for cause in network.causes
+        if cause.kind is CauseKind.TRIPOD
+        for target in _before(calibration, cause)
     ]
-    found = [cause for cause in (*unidentified, *network.suspects) if cause.kind is CauseKind.SIGHT]
-    return list(dict.fromkeys(exclusion(calibration, cause) for cause in found))
+    unidentified = [each for cause in network.unidentified for each in (cause, *cause.alternatives)]
+    suspects = [
+        exclusion(calibration, cause)
+        for cause in (*unidentified, *network.suspects)
+        if cause.kind is CauseKind.SIGHT
+    ]
+    return list(dict.fromkeys([*outdated, *suspects]))
 
 
 def exclusion(calibration: TargetCalibration, cause: Cause) -> str:

@@ -168,9 +168,10 @@ class CauseSearch:
         if len(chosen) + 1 < MAX_CAUSES:
             neighbours.append([(*chosen, *pair) for pair in combinations(others, 2)])
         neighbours.append([(*rest, other) for rest in without for other in others])
-        neighbours.append(
-            [(*rest, *pair) for rest in without for pair in self._pairs if not {*pair} & {*rest}]
-        )
+        if len(chosen) < MAX_CAUSES:
+            neighbours.append(
+                [(*rest, *pair) for rest in without for pair in self._pairs if not {*pair} & {*rest}]
+            )
         if len(chosen) > 1:
             fewer = [tuple(each for each in chosen if each not in pair) for pair in combinations(chosen, 2)]
             neighbours.append([(*rest, other) for rest in fewer for other in others])

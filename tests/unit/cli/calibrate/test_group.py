@@ -53,6 +53,23 @@ def falsified(markers: Path, folder: Path, station: int, target: int, extra_m: f
     return path
 
 
+def written(field: TargetField, folder: Path) -> Path:
+    """Write the measurements of a simulated field of targets to a file."""
+    readings = field.measure()
+    rows = zip(
+        readings.station + 1,
+        readings.target + 1,
+        (readings.horizontal_rad % (2 * np.pi)).tolist(),
+        readings.zenith_rad.tolist(),
+        readings.distance_m.tolist(),
+        strict=True,
+    )
+    lines = ["station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m"]
+    path = folder / "simulated.csv"
+    path.write_text("\n".join([*lines, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
+    return path
+
+
 def only(markers: Path, folder: Path, targets: str) -> Path:
     """Copy a marker file with these targets only."""
     lines = markers.read_text(encoding="utf-8").splitlines()
@@ -200,6 +217,16 @@ def test_excluded_target_is_the_way_on(tsgt: Tsgt, tmp_path: Path, weights: str)
     assert all(check["ok"] for check in done.json()["checks"] if "noise_scale" in check["name"])
 
 
+def test_tripod_that_moved_names_the_way_on(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The command that is printed leaves out what was measured before it moved, and succeeds."""
+    moved = (1, 4, np.array([0.006, -0.004, 0.003, 2e-4]))
+    path = written(TargetField(rng=np.random.default_rng(2), targets=9, moved_tripod=moved), tmp_path)
+    done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT)
+    assert done.code == 3
+    assert "--exclude 2:1,2:2,2:3,2:4" in done.err.splitlines()[-1]
+    assert tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--exclude", "2:1,2:2,2:3,2:4").code == 0
+
+
 def test_residual_limit_accepts_the_rest(tsgt: Tsgt, tmp_path: Path) -> None:
     """The limit is a check of its own, printed with its value."""
     path = documented(0, tmp_path)
@@ -222,16 +249,8 @@ def test_instrument_error_is_written(tsgt: Tsgt, tmp_path: Path) -> None:
     """An index error of 0.3 mrad at station 2 is named, applied and written, with the joint covariance."""
     field = TargetField(
         rng=np.random.default_rng(1), errors={(1, InstrumentError.VERTICAL_INDEX): 3e-4}, both_faces=True
-    ).measure()
-    lines = ["station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m"]
-    lines += [
-        f"{station + 1},{target + 1},{h % (2 * np.pi)},{z},{d}"
-        for station, target, h, z, d in zip(
-            field.station, field.target, field.horizontal_rad, field.zenith_rad, field.distance_m, strict=True
-        )
-    ]
-    path, output = tmp_path / "index.csv", tmp_path / "frames.toml"
-    path.write_text("\n".join(lines), encoding="utf-8")
+    )
+    path, output = written(field, tmp_path), tmp_path / "frames.toml"
     done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--output", output)
     assert done.code == 0
     assert "station 2: the residuals look like a vertical index error" in done.err

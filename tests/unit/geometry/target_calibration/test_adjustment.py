@@ -215,3 +215,10 @@ def test_levelled_station_that_is_tilted_fails_a_check() -> None:
     assert failed["tilt_mrad"].station == 2
     assert failed["tilt_mrad"].value == pytest.approx(1.0, abs=0.1)
     np.testing.assert_array_equal(solved.network.rotation[1, 2, :2], [0.0, 0.0])
+
+
+def test_noise_four_times_is_not_taken_for_many_wrong_sights() -> None:
+    """The checks fail; no list of suspects that would leave out a third of the sights."""
+    solved = calibrated(0, noise=4.0, targets=13)
+    assert solved.causes == solved.suspects == ()
+    assert any(not check.ok for check in checks(solved))

@@ -53,7 +53,7 @@ def falsified(markers: Path, folder: Path, station: int, target: int, extra_m: f
     return path
 
 
-def written(field: TargetField, folder: Path) -> Path:
+def written_to(field: TargetField, folder: Path) -> Path:
     """Write the measurements of a simulated field of targets to a file."""
     readings = field.measure()
     rows = zip(
@@ -135,7 +135,8 @@ def test_falsified_target_is_rejected(
             assert solved["rms_mm"] < limit_mm
         assert done.err.count("rejected") == 1
         assert f"station {station}: target {target} rejected" in done.err
-        assert "the station erred, its distance is wrong" in done.err
+        # Of a target near the station nearly certain only: it might have moved along the line of sight.
+        assert "the station erred, its distance is wrong" in done.err or ", its distance) or" in done.err
 
 
 @pytest.mark.parametrize("targets", ["1234", "1235", "1245", "1345", "2345"])
@@ -220,7 +221,7 @@ def test_excluded_target_is_the_way_on(tsgt: Tsgt, tmp_path: Path, weights: str)
 def test_tripod_that_moved_names_the_way_on(tsgt: Tsgt, tmp_path: Path) -> None:
     """The command that is printed leaves out what was measured before it moved, and succeeds."""
     moved = (1, 4, np.array([0.006, -0.004, 0.003, 2e-4]))
-    path = written(TargetField(rng=np.random.default_rng(2), targets=9, moved_tripod=moved), tmp_path)
+    path = written_to(TargetField(rng=np.random.default_rng(2), targets=9, moved_tripod=moved), tmp_path)
     done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT)
     assert done.code == 3
     assert "--exclude 2:1,2:2,2:3,2:4" in done.err.splitlines()[-1]
@@ -250,7 +251,7 @@ def test_instrument_error_is_written(tsgt: Tsgt, tmp_path: Path) -> None:
     field = TargetField(
         rng=np.random.default_rng(1), errors={(1, InstrumentError.VERTICAL_INDEX): 3e-4}, both_faces=True
     )
-    path, output = written(field, tmp_path), tmp_path / "frames.toml"
+    path, output = written_to(field, tmp_path), tmp_path / "frames.toml"
     done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--output", output)
     assert done.code == 0
     assert "station 2: the residuals look like a vertical index error" in done.err

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 from collections import deque
 
-from tsgt.estimation.imu_setup_monitor import WINDOW_NS
 from tsgt.master.classic import DUPLICATE_WINDOW
 from tsgt.master.stream_server import QUEUE_LINES
 from tsgt.radio.superframe import QUEUE_CAPACITY
@@ -15,14 +14,16 @@ from tsgt.timesync import MAX_SAMPLES
 MAX_ENTRIES = 500
 """Default bound of a collection."""
 
-MAX_IMU_LINES_PER_S = 25  # of the simulated IMU, which sends ten samples in a line
+MAX_IMU_LINES = 3000
+"""Lines of 50 s, and as many again that were held back and arrive at once."""
 
 STATED_BOUNDS = {
     ("_Reader", "_queue"): QUEUE_LINES,
     ("StationIngest", "_known"): DUPLICATE_WINDOW,
     ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
     ("SendQueue", "_queue"): QUEUE_CAPACITY,
-    ("ImuSetupMonitor", "_records"): WINDOW_NS // 1_000_000_000 * MAX_IMU_LINES_PER_S,
+    ("ImuSetupMonitor", "_records"): MAX_IMU_LINES,
+    ("ImuTakeover", "_records"): MAX_IMU_LINES,
     **dict.fromkeys(
         (("ClockSegment", name) for name in ("_forward", "_samples", "_received_ns")), MAX_SAMPLES
     ),

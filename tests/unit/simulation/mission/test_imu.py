@@ -11,6 +11,8 @@ import pytest
 from harness.missions import SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig, SimulatedImu
+from tsgt.estimation import centroid_at_point
+from tsgt.geometry import log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.imu_samples import imu_failures
@@ -135,3 +137,37 @@ def test_poses_survive_a_fault_of_the_imu(tmp_path: Path, kind: str) -> None:
     assert check_invariants(run) == []
     poses = run.master_logs[0].valid_poses()
     assert np.count_nonzero(poses.series == "predicted") > 0.9 * 20 * 40.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "rms_m", "rms_deg"), [(3, 4.5e-3, 0.12), (2, 6e-3, 0.15)])
+def test_live_poses_are_accurate(tmp_path: Path, count: int, rms_m: float, rms_deg: float) -> None:
+    """At the time of sending, from half a minute after the start on, of the prisms' centroid."""
+    scenario = with_stations(WITH.model_copy(update={"pipeline": ScenarioConfig().pipeline}), count)
+    run = run_mission(tmp_path, scenario, duration_s=75.0, protocol=SUPERFRAME, seed=0)
+    assert check_invariants(run) == []
+    (log,) = run.master_logs
+    poses = log.valid_poses()
+    time_s = (poses.stamp_ns - log.unix_at_zero_ns) / 1e9
+    rows = (poses.series == "predicted") & (time_s > 30.0) & (time_s < 75.0)
+    assert np.count_nonzero(rows) > 0.99 * 20 * 45.0
+    truth = run.true_poses(time_s[rows])
+    rotation = rotation_from_quaternion(poses.orientation_xyzw[rows])
+    estimated = transform_from(rotation, poses.position_m[rows])
+    centroid_m = centroid_at_point(run.parameters)
+    error_m = np.linalg.norm(
+        transform_points(estimated, centroid_m) - transform_points(truth, centroid_m), axis=1
+    )
+    error_deg = np.degrees(np.linalg.norm(log_so3(rotation @ np.swapaxes(truth[:, :3, :3], 1, 2)), axis=1))
+    print(
+        count,
+        [
+            1e3 * np.sqrt(np.mean(error_m**2)),
+            np.sqrt(np.mean(error_deg**2)),
+            1e3 * np.quantile(error_m, 0.95),
+            np.quantile(error_deg, 0.95),
+        ],
+    )
+    for error, rms in ((error_m, rms_m), (error_deg, rms_deg)):
+        assert np.sqrt(np.mean(error**2)) < rms
+        assert np.quantile(error, 0.95) < 2 * rms

@@ -37,7 +37,7 @@ class PipelineConfig(Model):
     estimator: Literal["linear", "continuous"] = "continuous"
     """Estimator: linear interpolation between measurements, or one smooth trajectory."""
     rate_hz: Annotated[float, Field(ge=0.01, le=1000)] = 20.0
-    """Poses per second."""
+    """Poses per second; with an IMU, whose samples say what the robot does in between, 20 to 100."""
     outage_limit_s: Positive = 1.0
     """Maximum gap between two measurements of a prism; no poses in longer gaps."""
     transport_limit_s: Positive = 2.0

@@ -159,15 +159,9 @@ def test_live_poses_are_accurate(tmp_path: Path, count: int, rms_m: float, rms_d
         transform_points(estimated, centroid_m) - transform_points(truth, centroid_m), axis=1
     )
     error_deg = np.degrees(np.linalg.norm(log_so3(rotation @ np.swapaxes(truth[:, :3, :3], 1, 2)), axis=1))
-    print(
-        count,
-        [
-            1e3 * np.sqrt(np.mean(error_m**2)),
-            np.sqrt(np.mean(error_deg**2)),
-            1e3 * np.quantile(error_m, 0.95),
-            np.quantile(error_deg, 0.95),
-        ],
-    )
-    for error, rms in ((error_m, rms_m), (error_deg, rms_deg)):
-        assert np.sqrt(np.mean(error**2)) < rms
-        assert np.quantile(error, 0.95) < 2 * rms
+    figures = [
+        (float(np.sqrt(np.mean(each**2))), float(np.quantile(each, 0.95))) for each in (error_m, error_deg)
+    ]
+    for (found, p95), limit in zip(figures, (rms_m, rms_deg), strict=True):
+        assert found < limit
+        assert p95 < 2 * limit

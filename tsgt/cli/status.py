@@ -105,6 +105,8 @@ def imu_label(imu: ImuStatus) -> tuple[str, bool]:
         return f"SILENT {duration(imu.age_s)}", False
     if imu.problem:
         return "CHECK IT", False
+    if imu.use == "wrong_setup":
+        return "ITS SET-UP IS WRONG", False
     if imu.use == "disagrees" or imu.disagreement:
         return "DISAGREES WITH THE PRISMS", False
     return ("NOT IN USE YET" if imu.use == "starting" else "OK"), True

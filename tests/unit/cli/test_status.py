@@ -134,6 +134,7 @@ def test_sound_imu_is_shown_with_its_biases() -> None:
         ({"age_s": 3.0}, "SILENT 3.0 s", False),
         ({"problem": "it repeats the same values"}, "it repeats the same values", False),
         ({"use": "disagrees", "disagreement": "gyro against prisms"}, "DISAGREES WITH THE PRISMS", False),
+        ({"use": "wrong_setup", "disagreement": "mounting"}, "ITS SET-UP IS WRONG", False),
         ({"use": "starting"}, "NOT IN USE YET", True),
     ],
 )

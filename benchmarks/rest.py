@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from harness.prior_motion import CENTRE_M
 from harness.scene import FRAMES
-from harness.slow_motion import creeping, measure_along
+from harness.slow_motion import LINE_OF_SIGHT, creeping, measure_along
 from measuring import normalised_squared
 
 from tsgt.analysis.evaluation import (
@@ -30,6 +31,7 @@ from tsgt.estimation import build_observations
 from tsgt.geometry import cartesian_to_polar, invert, log_so3, polar_to_cartesian, transform_points
 from tsgt.geometry.batch import find_rest, fit_trajectory, in_rest
 from tsgt.geometry.trajectory import Observations
+from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
 from tsgt.simulation.scenario_files import find_scenario
 from tsgt.simulation.world import scenario_world
@@ -41,10 +43,11 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.simulation.world import World
 
-ROBOTS, MINUTE_S = 20, 60.0
+ROBOTS, FITTED, MINUTE_S = 20, 5, 60.0
 SEEDS, DRIVE_S = (1, 2, 3), 600.0
 RANGE_SIGMA_M, POINTING_SIGMA_M, ANGLE_SIGMA_RAD, TIME_SIGMA_S = 0.002, 0.001, np.radians(1 / 3600), 6e-4
 INTERVAL_S, TICK_JITTER_S = 0.4, 0.004
+POSITION_95 = 7.815  # Of the chi-square distribution with 3 degrees of freedom
 
 
 def rocking(amplitude_m: float, frequency_hz: float) -> Callable[[FloatArray], FloatArray]:
@@ -66,6 +69,24 @@ def share_at_rest(
         )
         total_s += sum(each.end_s - each.start_s for each in find_rest(observations))
     return total_s / ROBOTS / MINUTE_S
+
+
+def rocking_errors(along_m: Callable[[FloatArray], FloatArray]) -> str:
+    """Errors of the poses of robots that rock for a minute, where they are taken for rest; at the prisms' centroid."""
+    errors, nees = [], []
+    for seed in range(FITTED):
+        found = fit_trajectory(
+            measure_along(along_m, until_s=MINUTE_S, seed=seed), prior=MotionPrior(), noise_scale=1.0
+        )
+        at_s = np.arange(2.0, MINUTE_S - 2.0, 0.05)
+        at_s = at_s[in_rest(found.rest, at_s) >= 0]
+        states, covariance = found.trajectory.at(at_s, dim=6)
+        truth = np.tile(CENTRE_M, (len(at_s), 1))
+        truth[:, :2] += along_m(at_s)[:, None] * LINE_OF_SIGHT
+        errors.append(np.linalg.norm(states.position - truth, axis=1))
+        nees.append(normalised_squared(states.position - truth, covariance[:, :3, :3]))
+    error_mm, beyond = 1e3 * np.concatenate(errors), np.concatenate(nees) > POSITION_95
+    return f"{np.sqrt(np.mean(error_mm**2)):.2f} | {error_mm.max():.1f} | {beyond.mean():.1%}"
 
 
 def measured_drive(seed: int) -> tuple[World, Observations]:
@@ -181,6 +202,11 @@ def main() -> None:
             held_out(Path(each))
         return
     still = creeping(0.0)
+    print("| a minute of a robot that | rms mm | largest mm | outside the 95 % ellipsoid |")
+    print(f"| stands | {rocking_errors(still)} |")
+    for amplitude_mm, frequency_hz in ((1, 0.2), (1, 1.0), (2, 0.2), (2, 1.0)):
+        errors = rocking_errors(rocking(amplitude_mm / 1e3, frequency_hz))
+        print(f"| rocks by {amplitude_mm} mm at {frequency_hz} Hz | {errors} |", flush=True)
     print("| a minute of a robot that | taken for rest |")
     print(f"| stands | {share_at_rest(still):.1%} |")
     print(f"| stands, two stations out | {share_at_rest(still, stations=(1,)):.1%} |")

@@ -163,6 +163,7 @@ def test_start_from_nothing(stations: int, limit_mm: float, limit_deg: float) ->
     """The heading is found without any pose, with one station as soon as the robot moves."""
     window = tracked(stations).window
     assert window.converged
+    assert not window.ambiguous
     time_s = np.arange(5.0, 6.8, 0.1)
     states, covariance = window.trajectory().at(time_s)
     position, rotation = DRIVE.pose_at(time_s)

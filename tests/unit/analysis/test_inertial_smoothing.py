@@ -41,7 +41,9 @@ def position_errors_m(found: SmoothedRecording) -> FloatArray:
     return errors[MARGIN:-MARGIN]
 
 
-@pytest.mark.parametrize(("stations", "limit_mm"), [(3, 1.2), (2, 1.6), (1, 3.0)])
+@pytest.mark.parametrize(
+    ("stations", "limit_mm"), [(3, 1.2), pytest.param(2, 1.6, marks=pytest.mark.slow), (1, 3.0)]
+)
 def test_stations_and_an_imu_suffice(stations: int, limit_mm: float) -> None:
     """All poses are valid, and more exact than three stations give without an IMU."""
     found = smooth(imu_recording(DRIVE, stations=stations))
@@ -99,6 +101,7 @@ def test_gap_of_the_samples_has_the_poses_of_the_stations_alone() -> None:
     np.testing.assert_array_equal(found.poses.position_m[inside], alone.poses.position_m[inside])
 
 
+@pytest.mark.slow
 def test_set_up_is_a_common_part_of_the_covariance() -> None:
     """As without an IMU: a second station that is uncertain by 2 mm shows in every pose."""
     recording = imu_recording(DRIVE, stations=2)
@@ -110,6 +113,7 @@ def test_set_up_is_a_common_part_of_the_covariance() -> None:
     assert np.sqrt(found[:, 0, 0]).max() < 4e-3
 
 
+@pytest.mark.slow
 def test_poses_of_the_imu_are_those_of_its_frame() -> None:
     """Its origin is one of the points that have a name."""
     recording = imu_recording(DRIVE, stations=2)

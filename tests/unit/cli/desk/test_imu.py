@@ -93,6 +93,7 @@ def test_evaluate_predicts_held_out_measurements_with_the_imu(tsgt: Tsgt, folder
     assert found["continuous_imu"]["mean"] < 0.5 * found["linear"]["mean"]
 
 
+@pytest.mark.slow
 def test_report_shows_the_imu(tmp_path: Path) -> None:
     """Rate, biases with sigmas, and the gyro against the prisms; what the samples were made with is found."""
     path = tmp_path / "field.jsonl"

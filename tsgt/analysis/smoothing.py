@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.imu_setup import wrong_imu_setup
 from tsgt.analysis.inertial_smoothing import fit_with_imu
 from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.validation import (
@@ -107,7 +108,7 @@ def smooth_recording(
     The hyperparameters are estimated from the measurements. Those of the recording, which the live estimator used, bound the
     process noise: at least a third of them, and all of them while prisms are occluded. Where the recording has samples of an
     IMU, and its parameters, they replace the motion prior, and measurements of one or two prisms are enough; set-up and noise
-    are estimated without them. Progress is a fraction, 0 to 1. Raises as :func:`tsgt.analysis.processing.process`, also
+    are estimated without them. An IMU whose set-up contradicts the measurements is not used. Progress is a fraction, 0 to 1. Raises as :func:`tsgt.analysis.processing.process`, also
     RecordingError if no trajectory fits.
     """
     parameters = recording.parameters
@@ -139,7 +140,9 @@ def smooth_recording(
     imu, problem = None, ""
     if parameters.imu is not None and not recording.imu_samples:
         problem = "the recording has no samples of it"
-    if with_imu:
+    if with_imu and complete:
+        problem = wrong_imu_setup(parameters, measurements, recording.imu_samples)
+    if with_imu and not problem:
         try:
             imu = fit_with_imu(
                 parameters,

@@ -67,7 +67,7 @@ def test_imu_that_contradicts_the_measurements_is_left_out() -> None:
     wrong = replace(IMU, orientation_xyzw=(x, y, z, w))
     found = smooth(imu_recording(DRIVE, imu=wrong))
     assert found.imu is None
-    assert "the bias of the accelerometer would be" in found.imu_problem
+    assert "the mounting of the IMU is wrong by 4." in found.imu_problem
     assert 1e3 * np.sqrt((position_errors_m(found) ** 2).mean()) < 6.0
 
 

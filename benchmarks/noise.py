@@ -24,7 +24,8 @@ from tsgt.analysis.evaluation import NormalisedErrorStatistics, held_out_errors
 from tsgt.config import ScenarioConfig, level_frame
 from tsgt.estimation import build_observations, instrument_time_sigma_s
 from tsgt.geometry import cartesian_to_polar, invert, log_so3, polar_to_cartesian, transform_points
-from tsgt.geometry.batch import TrajectoryFit, find_rest, fit_trajectory, in_rest, tune
+from tsgt.geometry.batch import TrajectoryFit, fit_trajectory, tune
+from tsgt.geometry.rest import find_rest, in_rest
 from tsgt.geometry.trajectory import Observations
 from tsgt.recording import load_recording
 from tsgt.simulation.world import World, scenario_world

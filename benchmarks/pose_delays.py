@@ -4,7 +4,10 @@ Runs the live estimator over the measurements of simulated recordings and compar
 after the start to 5 s before the end.
 
     tsgt simulate dynamic --duration 300 --seed 31 --output dynamic.jsonl --truth dynamic.tum
-    python benchmarks/run.py pose_delays dynamic.jsonl dynamic.tum [ANOTHER.jsonl ANOTHER.tum ...]
+    python benchmarks/run.py pose_delays [--no-rest] dynamic.jsonl dynamic.tum [ANOTHER.jsonl ANOTHER.tum ...]
+
+Each is split into poses at rest, moving ones, and those of the first second after driving off. With ``--no-rest`` smoothed poses are
+those of the motion prior alone.
 """
 
 from __future__ import annotations
@@ -13,16 +16,24 @@ import sys
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.analysis.evaluation import LivePoseErrors, read_tum
 from tsgt.estimation import LiveEstimator, centroid_at_point
 from tsgt.geometry import rotation_from_quaternion, transform_from
+from tsgt.geometry.trajectory import FixedLagSmoother
 from tsgt.recording import PoseRecord, load_recording
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.analysis.evaluation import Reference
 
 DELAYS_S = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0)
 FROM_NS, BEFORE_NS = 10_000_000_000, 5_000_000_000
+SPEED_NS, REST_MPS, AFTER_NS = 50_000_000, 0.002, 1_000_000_000
 
 
 def live_poses(recording: Path) -> dict[str, list[PoseRecord]]:
@@ -37,6 +48,20 @@ def live_poses(recording: Path) -> dict[str, list[PoseRecord]]:
             if isinstance(record, PoseRecord):
                 found[record.series].append(record)
     return found
+
+
+def parts(stamp_ns: NDArray[np.int64], reference: Reference) -> dict[str, NDArray[np.bool_]]:
+    """Return masks of poses by the true motion at their stamps."""
+    before, after = (reference.at(stamp_ns + each)[0] for each in (-SPEED_NS, SPEED_NS))
+    at_rest = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1) < REST_MPS * 2e-9 * SPEED_NS
+    driving_off_ns = stamp_ns[:-1][at_rest[:-1] & ~at_rest[1:]]
+    since_ns = stamp_ns[:, None] - driving_off_ns
+    return {
+        "all": np.ones_like(at_rest),
+        "at rest": at_rest,
+        "moving": ~at_rest,
+        "1 s after driving off": ~at_rest & ((since_ns > 0) & (since_ns <= AFTER_NS)).any(axis=1),
+    }
 
 
 def print_errors(recording: Path, truth: Path) -> None:
@@ -60,18 +85,26 @@ def print_errors(recording: Path, truth: Path) -> None:
             reference.at(stamp_ns)[0],
             centroid_at_point(parameters),
         )
-        found = errors.statistics(None, None)
-        print(
-            f"{series:>14}: {len(valid) / len(poses):6.1%} valid, origin {found.position_rms_mm:5.2f} mm rms "
-            f"(p95 {found.position_p95_mm:5.2f}), centroid {found.centroid.position_rms_mm:5.2f} mm, "
-            f"{found.orientation_rms_deg:.3f} deg, NEES {found.nees.mean:.2f} (6), above 22.5 in 1000: "
-            f"{1e3 * np.mean(errors.nees > 22.46):.2f}, largest {errors.nees.max():.0f}"
-        )
+        print(f"{series}: {len(valid) / len(poses):.1%} valid")
+        for part, rows in parts(stamp_ns, reference).items():
+            if not rows.any():
+                continue
+            some = errors.select(rows)
+            found = some.statistics(None, None)
+            print(
+                f"{part:>22}: {len(some.nees):5}, origin {found.position_rms_mm:5.2f} mm rms "
+                f"(p95 {found.position_p95_mm:5.2f}), centroid {found.centroid.position_rms_mm:5.2f} mm, "
+                f"{found.orientation_rms_deg:.3f} deg, NEES {found.nees.mean:.2f} (6), above 22.5 in 1000: "
+                f"{1e3 * np.mean(some.nees > 22.46):.2f}, largest {some.nees.max():.0f}"
+            )
 
 
 def main() -> None:
     """Print the tables of all recordings."""
-    for recording, truth in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
+    if "--no-rest" in sys.argv:
+        FixedLagSmoother.smoothed_trajectory = FixedLagSmoother.trajectory  # type: ignore[method-assign]
+    files = [each for each in sys.argv[1:] if each != "--no-rest"]
+    for recording, truth in zip(files[::2], files[1::2], strict=True):
         print_errors(Path(recording), Path(truth))
 
 

@@ -29,7 +29,8 @@ from tsgt.analysis.smoothing import estimate_motion_model
 from tsgt.analysis.validation import plausible_measurements
 from tsgt.estimation import build_observations
 from tsgt.geometry import cartesian_to_polar, invert, log_so3, polar_to_cartesian, transform_points
-from tsgt.geometry.batch import find_rest, fit_trajectory, in_rest
+from tsgt.geometry.batch import fit_trajectory
+from tsgt.geometry.rest import find_rest, in_rest
 from tsgt.geometry.trajectory import Observations
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording

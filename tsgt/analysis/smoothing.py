@@ -33,12 +33,12 @@ from tsgt.estimation import (
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import (
     NOISE_FLOOR_SHARE,
-    find_rest,
     fit_trajectory,
     overall_scale,
     tune,
     with_noise_floor,
 )
+from tsgt.geometry.rest import find_rest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -47,9 +47,10 @@ if TYPE_CHECKING:
     from tsgt.analysis.inertial_smoothing import ImuUse
     from tsgt.analysis.refinement import Refine
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.batch import RestInterval, TrajectoryFit
+    from tsgt.geometry.batch import TrajectoryFit
     from tsgt.geometry.inertial import InertialFit
     from tsgt.geometry.motion_calibration import RefinedSetup
+    from tsgt.geometry.rest import RestInterval
     from tsgt.geometry.trajectory import Observations
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording

@@ -274,7 +274,7 @@ class ContinuousEstimator:
         common: FloatArray | None = None
         time_s = (stamp_ns - self._origin_ns) / 1e9
         if self._window.initialised:
-            trajectory = self._window.trajectory()
+            trajectory = self._window.smoothed_trajectory()
             states, covariance = trajectory.at(time_s, dim=_POSE_DIM)
             common = trajectory.common_at(time_s, dim=_POSE_DIM)
         reliable = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)

@@ -129,6 +129,10 @@ class TrajectoryWindow(Protocol):
         """Return the trajectory over the window."""
         ...
 
+    def smoothed_trajectory(self) -> QueriedTrajectory:
+        """Return the same for poses between measurements, with rest."""
+        ...
+
 
 class InertialWindow(TrajectoryWindow, Protocol):
     """The same with an IMU."""

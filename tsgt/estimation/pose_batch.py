@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum, IntFlag
@@ -45,6 +46,7 @@ class Degradation(IntFlag):
     RESIDUAL = 16
 
 
+@functools.cache
 def degradation_words(value: int) -> tuple[stream_records.Degradation, ...]:
     """Return the words on the stream of a value of :class:`Degradation`."""
     return tuple(
@@ -182,7 +184,6 @@ class PoseBatch:
             return
         computed = np.isfinite(self.position_m[:, 0])
         reasons, kinds = [reason.word for reason in Reason], [kind.word for kind in Kind]
-        degradations = [degradation_words(value) for value in range(2 * max(Degradation))]
         uses = [use.word for use in ImuUse]
         # One conversion to Python numbers per array, not per element.
         rows = zip(
@@ -229,7 +230,7 @@ class PoseBatch:
                 valid=reason == Reason.VALID,
                 reason=reasons[reason],
                 quality="invalid" if reason else "degraded" if degraded else "good",
-                degraded_by=degradations[degraded],
+                degraded_by=degradation_words(degraded),
                 residual_m=None if math.isnan(residual) else residual,
                 stations=shares,
             )

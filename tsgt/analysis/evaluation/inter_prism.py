@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry import interpolate
-from tsgt.geometry.batch import Series, find_rest_in_series
+from tsgt.geometry.rest import Series, find_rest_in_series
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

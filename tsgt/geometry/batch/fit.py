@@ -21,14 +21,14 @@ from tsgt.geometry.batch.hyperparameters import (
     with_noise_floor,
 )
 from tsgt.geometry.batch.noise_scales import scale_noise
-from tsgt.geometry.batch.rest import (
+from tsgt.geometry.rest import (
     RestInterval,
     add_vibration,
+    find_rest,
     rest_factors,
     steps_in_rest,
     with_vibration,
 )
-from tsgt.geometry.batch.rest_detection import find_rest
 from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest_knots, solve
 from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas

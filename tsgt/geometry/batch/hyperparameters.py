@@ -32,8 +32,7 @@ from tsgt.geometry.batch.process_moments import (
     expected_moments,
     expected_squared_distances,
 )
-from tsgt.geometry.batch.rest import in_rest, rest_factors, steps_in_rest, with_vibration
-from tsgt.geometry.batch.rest_detection import find_rest
+from tsgt.geometry.rest import find_rest, in_rest, rest_factors, steps_in_rest, with_vibration
 from tsgt.geometry.trajectory.gauss_newton import (
     LOOSE_GAIN_TOLERANCE,
     REJECTION_THRESHOLD,

@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.batch.rest import in_rest
-from tsgt.geometry.batch.rest_detection import Series
+from tsgt.geometry.rest import Series, in_rest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from tsgt.geometry.batch.rest import RestInterval
+    from tsgt.geometry.rest import RestInterval
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.gauss_newton import Solution
     from tsgt.geometry.trajectory.measurement_factors import Observations

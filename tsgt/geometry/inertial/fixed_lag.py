@@ -49,14 +49,13 @@ from tsgt.geometry.trajectory.gauss_newton import (
     nearest_knots,
 )
 from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
+from tsgt.geometry.trajectory.measurement_factors import merge_observations, time_order
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
     MAX_STEPS,
     MeasurementWindow,
     is_below_step_tolerance,
-    merge_observations,
     normalised_innovations,
-    time_order,
 )
 from tsgt.geometry.trajectory.motion_prior import transition
 from tsgt.geometry.trajectory.states import States, concatenate_states
@@ -238,6 +237,10 @@ class InertialFixedLagSmoother(MeasurementWindow):
                 self._predicted_common,
             )
         return self._trajectory
+
+    def smoothed_trajectory(self) -> WindowTrajectory:
+        """Return :meth:`trajectory`: the samples say themselves whether the robot stands."""
+        return self.trajectory()
 
     def common_at(self, time_s: float, *, dim: int = _POSE_DIM) -> FloatArray | None:
         """Return the (1, 6, 6) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""

@@ -31,17 +31,18 @@ from tsgt.geometry.trajectory.gauss_newton import (
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
 from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
+from tsgt.geometry.trajectory.measurement_factors import time_order
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
     MAX_STEPS,
     MeasurementWindow,
     is_below_step_tolerance,
     normalised_innovations,
-    time_order,
 )
 from tsgt.geometry.trajectory.prediction_errors import PredictionErrorMonitor
 from tsgt.geometry.trajectory.propagation import Propagator, acceleration_response
 from tsgt.geometry.trajectory.query import Trajectory
+from tsgt.geometry.trajectory.rest_window import RestWindow
 from tsgt.geometry.trajectory.sensitivity import WindowSensitivity, common_covariance
 from tsgt.geometry.trajectory.states import STATE_DIM, ProcessFactors, States, concatenate_states
 
@@ -80,6 +81,8 @@ class FixedLagSmoother(MeasurementWindow):
         self._anchor: AnchorPrior | None = None
         self._solved: tuple[States, BlockCholesky] | None = None
         self._trajectory: Trajectory | None = None
+        self._rest = RestWindow(prior)
+        self._smoothed: Trajectory | None = None
         self._propagator: Propagator | None = None
         self._prediction_errors = PredictionErrorMonitor()
 
@@ -88,8 +91,15 @@ class FixedLagSmoother(MeasurementWindow):
         """Whether there is a trajectory."""
         return self._solved is not None
 
+    def update(self, new: Observations) -> None:
+        """Process measurements, in the order of time, none before :attr:`horizon_s`."""
+        self._rest.add(new)
+        self._smoothed = None
+        super().update(new)
+
     def marginalise_before(self, before_s: float) -> None:
         """Marginalise the states before a time; states from then on can still be queried."""
+        self._smoothed = None
         if self.observations is not None:
             if self._converged:
                 # Before the trajectory was reliable, or while it is not, its errors are not those of the ground.
@@ -174,6 +184,21 @@ class FixedLagSmoother(MeasurementWindow):
                 else common_covariance(self._common.of_window(knots, factor)),
             )
         return self._trajectory
+
+    def smoothed_trajectory(self) -> Trajectory:
+        """Return the trajectory for states between measurements, with rest as far as the window shows it."""
+        if self._smoothed is None:
+            self._smoothed = self._with_rest() or self.trajectory()
+        return self._smoothed
+
+    def _with_rest(self) -> Trajectory | None:
+        if not self._converged:
+            return None
+        observations, knots, _, anchor = self._window
+        try:
+            return self._rest.solve(observations, knots, anchor, self._common)
+        except GeometryError:  # by rounding alone
+            return None
 
     def common_at(self, time_s: float, *, dim: int = STATE_DIM) -> FloatArray | None:
         """Return the (1, dim, dim) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""

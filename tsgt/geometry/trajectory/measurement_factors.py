@@ -7,7 +7,7 @@ of the zenith angle), so that neither the circle's zero nor the vertical is sing
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -164,3 +164,20 @@ def line_of_sight_axes(points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     axes[:, 1, 0], axes[:, 1, 1] = sine, -cosine
     axes[:, 2, 0], axes[:, 2, 1], axes[:, 2, 2] = along[:, 2] * cosine, along[:, 2] * sine, -horizontal
     return axes, distance_m
+
+
+def time_order(held: Observations, new: Observations) -> NDArray[np.intp]:
+    """Sorting index of both, concatenated, by time, then prism, then station."""
+    keys = [(getattr(held, name), getattr(new, name)) for name in ("station", "prism", "time_s")]
+    return np.lexsort([np.concatenate(pair) for pair in keys])
+
+
+def merge_observations(held: Observations | None, new: Observations) -> Observations:
+    """Merge measurements of the same frames and layout in the order of time."""
+    if held is None:
+        return new
+    names = [field.name for field in fields(Observations) if field.name not in ("frames", "layout")]
+    order = time_order(held, new)
+    return replace(
+        held, **{name: np.concatenate([getattr(held, name), getattr(new, name)])[order] for name in names}
+    )

@@ -7,7 +7,6 @@ squared (NIS; Bar-Shalom), with the prediction's uncertainty: a large residual m
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from tsgt.errors import GeometryError
 from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD, REJECTION_THRESHOLD
 from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
-from tsgt.geometry.trajectory.measurement_factors import Observations
+from tsgt.geometry.trajectory.measurement_factors import merge_observations
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
+    from tsgt.geometry.trajectory.measurement_factors import Observations
 
 CONVERGED_SIGMA_RAD = 0.1  # Below, an initialised trajectory is tracked
 LOST_SIGMA_RAD = 0.2
@@ -229,21 +229,4 @@ def is_below_step_tolerance(step: FloatArray) -> bool:
     """Whether Jacobians stay the same over a step, (K, B), position and rotation first."""
     return bool(
         np.abs(step[:, :3]).max() < STEP_TOLERANCE_M and np.abs(step[:, 3:6]).max() < STEP_TOLERANCE_RAD
-    )
-
-
-def time_order(held: Observations, new: Observations) -> NDArray[np.intp]:
-    """Sorting index of both, concatenated, by time, then prism, then station."""
-    keys = [(getattr(held, name), getattr(new, name)) for name in ("station", "prism", "time_s")]
-    return np.lexsort([np.concatenate(pair) for pair in keys])
-
-
-def merge_observations(held: Observations | None, new: Observations) -> Observations:
-    """Merge measurements in the order of time."""
-    if held is None:
-        return new
-    names = [field.name for field in fields(Observations) if field.name not in ("frames", "layout")]
-    order = time_order(held, new)
-    return replace(
-        held, **{name: np.concatenate([getattr(held, name), getattr(new, name)])[order] for name in names}
     )

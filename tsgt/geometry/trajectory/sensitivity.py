@@ -100,8 +100,20 @@ class WindowSensitivity:
         factor: BlockCholesky,
     ) -> None:
         """Move the anchor to the last of the knots that are eliminated with ``factor``."""
-        solved = _Solved(past, linearised, weights, anchor, self._anchor)
-        self._anchor = sensitivity(factor, self._coupling(solved, knot_index, factor))[-1]
+        self._anchor = self.displacement(past, linearised, weights, knot_index, anchor, factor)[-1]
+
+    def displacement(
+        self,
+        observations: Observations,
+        linearised: LinearisedMeasurements,
+        weights: FloatArray,
+        knot_index: NDArray[np.intp],
+        anchor: AnchorPrior,
+        factor: BlockCholesky,
+    ) -> FloatArray:
+        """(K, 18, r) displacement of knots from the present anchor on, solved with ``factor``."""
+        solved = _Solved(observations, linearised, weights, anchor, self._anchor)
+        return sensitivity(factor, self._coupling(solved, knot_index, factor))
 
     def of_window(self, knots: States, factor: BlockCholesky) -> FloatArray:
         """(K, 18, r) displacement of the knots, computed once per solution."""

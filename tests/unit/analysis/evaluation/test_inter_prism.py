@@ -10,7 +10,7 @@ from tsgt.analysis.evaluation import InterPrismDistances, inter_prism
 from tsgt.analysis.evaluation.inter_prism import stationary_intervals
 from tsgt.estimation import Track, build_tracks
 from tsgt.geometry import exp_so3
-from tsgt.geometry.batch.rest_detection import MARGIN_S
+from tsgt.geometry.rest import MARGIN_S
 
 REFERENCES_MM = [987.0, 681.0, 815.0]
 

@@ -14,8 +14,7 @@ from tsgt.errors import GeometryError
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.batch import fit_trajectory, hyperparameters, scale_noise, tune, with_noise_floor
 from tsgt.geometry.batch.hyperparameters import MIN_MEASUREMENTS, partially_occluded
-from tsgt.geometry.batch.rest import in_rest
-from tsgt.geometry.batch.rest_detection import find_rest
+from tsgt.geometry.rest import find_rest, in_rest
 from tsgt.geometry.trajectory import States
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.model import MotionPrior, PipelineParameters

@@ -9,7 +9,7 @@ import pytest
 from harness.slow_motion import creeping, measure_along
 
 from tsgt.geometry.batch.noise_scales import MIN_SCALE, min_scales
-from tsgt.geometry.batch.rest import RestInterval
+from tsgt.geometry.rest import RestInterval
 
 WHOLE = [RestInterval(0.0, 40.0, 0.0)]
 

@@ -10,7 +10,7 @@ from harness.prior_motion import CENTRE_M
 from harness.slow_motion import LINE_OF_SIGHT, braking, creeping, measure_along
 
 from tsgt.geometry.batch import fit_trajectory
-from tsgt.geometry.batch.rest import RestInterval, in_rest, rest_factors, steps_in_rest, with_vibration
+from tsgt.geometry.rest import RestInterval, in_rest, rest_factors, steps_in_rest, with_vibration
 from tsgt.geometry.trajectory import initial_guess, knot_times, nearest_knots
 from tsgt.geometry.trajectory.gauss_newton import assemble, diffuse_prior
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas

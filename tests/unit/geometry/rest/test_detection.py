@@ -9,7 +9,7 @@ import pytest
 from harness.prior_motion import as_cartesian
 from harness.slow_motion import braking, creeping, measure_along
 
-from tsgt.geometry.batch.rest_detection import MARGIN_S, find_rest
+from tsgt.geometry.rest import MARGIN_S, find_rest
 
 UNTIL_S = 30.0
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.stats import chi2, f
 
-from tsgt.geometry.batch.rest import RestInterval
 from tsgt.geometry.polar import cartesian_to_polar
+from tsgt.geometry.rest.factors import RestInterval
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

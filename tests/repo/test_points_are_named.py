@@ -13,7 +13,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # A key such as `position_rms_mm`: an error, a sigma or a limit of a position.
 KEY = re.compile(r"`[a-z_.<>]*position(?:_[a-z]+)*_(?:rms|sigma|mean|max|std|norm|limit)[a-z_]*`")
 RMS = re.compile(r"\brms\b.*\d ?mm\b|\d ?mm\b.*\brms\b", re.DOTALL)
-POINT = re.compile(r"reference point|centroid|origin|`--point`|`point_m`")
+POINT = re.compile(r"reference point|centroid|origin|`--point`")
 OTHER = re.compile(r"target|tracks|inter-prism|between (the )?prisms")  # not errors of a pose
 
 

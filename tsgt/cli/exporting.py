@@ -18,11 +18,12 @@ from tsgt.cli.options import (
     point_option,
     recording_argument,
     reference_point_option,
+    resolved_point,
     unknown_suffix,
 )
 from tsgt.cli.output import refuse_overwrite, report_problem, require_extra
 from tsgt.cli.progress import TUNING, progress
-from tsgt.cli.recordings import imu_options, load, load_reference, resolved_point, write_lines
+from tsgt.cli.recordings import imu_options, load, load_reference, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import records_at
 from tsgt.model import ROBOT_ORIGIN, Parameters, ReferencePoint
@@ -79,7 +80,7 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
     show_default=False,
     help="File to write: .tum, .csv or .mcap.  [default: stdout, except for MCAP]",
 )
-@point_option
+@point_option()
 @reference_point_option
 @imu_options
 @keep_going_option

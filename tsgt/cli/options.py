@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from click.parser import _OptionParser, _ParsingState
 
     from tsgt.analysis.formats import TargetMeasurement
+    from tsgt.model import Parameters, ReferencePoint
 
 DEFAULT_SOCKET = Path("/run/tsgt/poses.sock")
 DEFAULT_CLIENT_SOCKET = Path("/run/tsgt/client.sock")
@@ -100,12 +101,15 @@ def constant_m(
 
 
 class PointType(click.ParamType[Any]):
-    """A point of the robot: X,Y,Z in m, perhaps with a name and a rotation; or the name alone, as text."""
+    """A point of the robot: X,Y,Z in m, perhaps with a name and a rotation; or the name alone, as text.
+
+    :func:`resolved_point` replaces a name by the point that it stands for.
+    """
 
     name = "point"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse the text; an impossible point is a usage error. The points that names stand for depend on the recording."""
+        """Parse the text; an impossible point is a usage error. The points that names stand for depend on the parameters."""
         from tsgt.estimation import parse_reference_point
 
         if not isinstance(value, str) or value.isidentifier():
@@ -116,20 +120,38 @@ class PointType(click.ParamType[Any]):
             self.fail(str(error), param, ctx)
 
 
-POINT_METAVAR = "NAME|[NAME=]X,Y,Z[,QX,QY,QZ,QW]"
+def resolved_point(
+    point: ReferencePoint | str, parameters: Parameters, *, option: str = "--point"
+) -> ReferencePoint:
+    """Return a point that was given by its name or its coordinates; an unknown name is a usage error."""
+    from tsgt.estimation import named_point
 
-point_option = click.option(
-    "--point",
-    type=PointType(),
-    metavar=POINT_METAVAR,
-    help="Point of the robot whose poses are given: robot, centroid, imu (its name), or position in m and quaternion in the "
-    "robot frame.  [default: as recorded, else the robot's origin]",
-)
+    if not isinstance(point, str):
+        return point
+    try:
+        return named_point(parameters, point)
+    except ValueError as error:
+        raise click.UsageError(f"{option}: {error}") from error
+
+
+_POINT_METAVAR = "NAME|[NAME=]X,Y,Z[,QX,QY,QZ,QW]"
+
+
+def point_option(default: str = "as recorded, else the robot's origin") -> Callable[[Any], Any]:
+    """Return the option for the reference point of poses; ``default``: what the point is without it."""
+    return click.option(
+        "--point",
+        type=PointType(),
+        metavar=_POINT_METAVAR,
+        help="Point of the robot that the poses are of: robot, centroid, imu (its name), or position in m and quaternion in "
+        f"the robot frame.  [default: {default}]",
+    )
+
 
 reference_point_option = click.option(
     "--reference-point",
     type=PointType(),
-    metavar=POINT_METAVAR,
+    metavar=_POINT_METAVAR,
     help="Point of the robot that the reference trajectory is of, as --point.  "
     "[default: as its file states, else the robot's origin]",
 )

@@ -16,11 +16,10 @@ from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.refinement import Refine
 from tsgt.analysis.setup_replacement import with_calibration, with_imu_mounting, with_layout
-from tsgt.cli.options import path_type
+from tsgt.cli.options import path_type, resolved_point
 from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
 from tsgt.config import load_imu_mounting, load_prism_layout, load_station_calibration
-from tsgt.estimation import named_point
 from tsgt.recording import RecordingHeader, encode_line, load_recording, read_imu_samples, write_atomically
 
 if TYPE_CHECKING:
@@ -124,16 +123,6 @@ class ImuOptions:
         return dataclasses.replace(recording, parameters=parameters, imu_samples=list(samples))
 
 
-def resolved_point(point: ReferencePoint | str, parameters: Parameters) -> ReferencePoint:
-    """Return a point that was given by its name or its coordinates; an unknown name is a usage error."""
-    if not isinstance(point, str):
-        return point
-    try:
-        return named_point(parameters, point)
-    except ValueError as error:
-        raise click.UsageError(f"--point: {error}") from error
-
-
 def load(
     path: Path,
     *,
@@ -179,7 +168,8 @@ def load_reference(
     reference = read_tum(path)
     if point is None:
         return reference
-    return dataclasses.replace(reference, reference_point=resolved_point(point, parameters))
+    point = resolved_point(point, parameters, option="--reference-point")
+    return dataclasses.replace(reference, reference_point=point)
 
 
 def pose_counts(poses: PoseBatch) -> dict[str, Any]:

@@ -11,10 +11,12 @@ from tsgt.config.calibration import (
     load_station_calibration,
     setup_covariance,
 )
+from tsgt.config.imu import IMU_NOISE
 from tsgt.errors import ConfigError
 from tsgt.model import (
     ARCSECOND_RAD,
     MIN_PRISMS,
+    ImuParameters,
     InstrumentNoise,
     Matrix4,
     MotionPrior,
@@ -29,7 +31,8 @@ if TYPE_CHECKING:
     from tsgt.config.master import MasterConfig
     from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
     from tsgt.config.scenario import ScenarioConfig, SimulatedStation
-    from tsgt.model import ImuParameters, ReferencePoint
+    from tsgt.config.scenario_imu import SimulatedImu
+    from tsgt.model import ReferencePoint
 
 
 def parameters(config: MasterConfig) -> Parameters:
@@ -123,10 +126,11 @@ def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
+def scenario_parameters(scenario: ScenarioConfig, *, imu: bool = False) -> Parameters:
     """Return the parameters of a master in the simulated world: exact set-up and true noise, but no IMU.
 
-    The prisms of a robot with an IMU are those that a station tracks, as for a master.
+    The prisms of a robot with an IMU are those that a station tracks, as for a master. With ``imu``: with the robot's IMU,
+    as its class and its place determine it, without errors of the device.
     """
     tracked = {station.prism for station in scenario.stations}
     prisms = [each for each in scenario.prisms if scenario.imu.model == "none" or each.prism in tracked]
@@ -144,6 +148,19 @@ def scenario_parameters(scenario: ScenarioConfig) -> Parameters:
         prisms=tuple(PrismPosition(prism=p.prism, position_m=p.position_m) for p in prisms),
         pipeline=pipeline_parameters(scenario.pipeline),
         reference_point=scenario.reference_point.point(),
+        imu=_simulated_imu(scenario.imu) if imu else None,
+    )
+
+
+def _simulated_imu(config: SimulatedImu) -> ImuParameters | None:
+    if config.model == "none":
+        return None
+    x, y, z, w = config.orientation_xyzw
+    norm = math.hypot(x, y, z, w)
+    return ImuParameters(
+        position_m=config.position_m,
+        orientation_xyzw=(x / norm, y / norm, z / norm, w / norm),
+        noise=IMU_NOISE[config.model],
     )
 
 

@@ -224,3 +224,8 @@ def reference_point_text(point: ReferencePoint) -> str:
 def point_label(point: ReferencePoint) -> str:
     """Return the name of a point in a sentence or a table."""
     return "the robot's origin" if point.name == ROBOT_FRAME else point.name
+
+
+def point_place(point: ReferencePoint) -> str:
+    """Return where a point is in the robot frame, to the millimetre."""
+    return "({}) m".format(", ".join(f"{round(value, 3) + 0.0:.10g}" for value in point.position_m))

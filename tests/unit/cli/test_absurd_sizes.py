@@ -217,7 +217,7 @@ def test_absurd_constant_is_a_usage_error(
     assert "-10000<=x<=10000" in outcome.err
 
 
-@pytest.mark.parametrize("option", [("--point", "1e300", "0", "0"), ("--area", "0", "1e12", "0", "30")])
+@pytest.mark.parametrize("option", [("--point", "1e300,0,0"), ("--area", "0", "1e12", "0", "30")])
 def test_absurd_coordinate_is_a_usage_error(good: dict[str, str], option: tuple[str, ...]) -> None:
     """Exit code 2."""
     with Files({name: text.encode() for name, text in good.items()}) as files:
@@ -229,7 +229,7 @@ def test_point_far_from_the_robot_is_an_error(good: dict[str, str]) -> None:
     with Files({name: text.encode() for name, text in good.items()}) as files:
         outcome = check_command(
             files,
-            ("analyse", "layout", "@prism_layout.example.toml", "--point", "2e7", "2e7", "2e7"),
+            ("analyse", "layout", "@prism_layout.example.toml", "--point", "2e7,2e7,2e7"),
         )
     assert outcome.code == 1
     assert "the point is 3.4641e+07 m from the prisms" in outcome.err

@@ -9,6 +9,8 @@ import numpy as np
 
 from tsgt.analysis.design import HEADING_COUNT
 from tsgt.analysis.figures.style import PAGE_WIDTH_MM, STROKES, drawing, save
+from tsgt.estimation import point_label, point_place
+from tsgt.model import ROBOT_FRAME
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.design import Perturbation, PoseAccuracy
     from tsgt.geometry import FloatArray
+    from tsgt.model import ReferencePoint
 
 _LAYOUT_HEIGHT_MM = 115.0
 
@@ -25,14 +28,15 @@ _LAYOUT_HEIGHT_MM = 115.0
 def draw_layouts(
     covariances: Mapping[str, FloatArray],
     distances: Mapping[float, Mapping[str, PoseAccuracy]],
-    point_m: FloatArray,
+    point: ReferencePoint,
     path: Path,
 ) -> None:
     """Draw the layouts over the robot's heading, and the first one over distance and arrangement of the stations.
 
     ``covariances``: by name in the order of the ranking, (N, 6, 6) of robot poses with
     :data:`tsgt.analysis.design.layout_study.HEADING_COUNT` headings at each place. ``distances``: by the stations' distance
-    in m and the name of their arrangement. ``point_m``: the point of the positions, (3,) in the robot frame. Raises MissingExtraError without matplotlib, OutputFileError if it cannot write.
+    in m and the name of their arrangement. ``point``: that of the positions. Raises MissingExtraError without matplotlib,
+    OutputFileError if it cannot write.
     """
     heading_deg = np.arange(HEADING_COUNT + 1) * (360 / HEADING_COUNT)
     distance_m = list(distances)
@@ -49,7 +53,7 @@ def draw_layouts(
             for row, sigmas_m in enumerate(([f.position_m for f in found], [f.rotation_rad for f in found])):
                 axes[row, 1].plot(distance_m, 1e3 * np.array(sigmas_m), **stroke._asdict(), label=arrangement)
         labels = (
-            f"one sigma of the position\nof {_point_text(point_m)} (mm)",
+            f"one sigma of the position (mm)\nof {_point_text(point)}",
             "one sigma of the rotation (mrad)",
         )
         for row, unit in enumerate(labels):
@@ -75,13 +79,13 @@ _PANEL_TITLES = (("x", "y", "z", "length"), ("roll", "pitch", "yaw", "angle"))
 def draw_perturbation(
     study: Sequence[Perturbation],
     first_order_per_mm: tuple[FloatArray, FloatArray],
-    point_m: FloatArray,
+    point: ReferencePoint,
     paths: Sequence[Path],
 ) -> None:
     """Draw mean and standard deviation of the pose errors over the noise, per axis and of the norm.
 
     ``study``: in the order of the noise. ``first_order_per_mm``: sigmas of position (m) and rotation (rad) for 1 mm of
-    noise, (3,) each. ``point_m`` and exceptions as for :func:`draw_layouts`.
+    noise, (3,) each. ``point`` and exceptions as for :func:`draw_layouts`.
     """
     noise_mm = np.array([1e3 * each.noise_m for each in study])
     position_mm = 1e3 * np.array(
@@ -106,7 +110,7 @@ def draw_perturbation(
                 if column < 3:
                     _first_order(panel, noise_mm, expected[row][:, column])
                 panel.set_title(name)
-            position_label = f"position error of\n{_point_text(point_m)} (mm)"
+            position_label = f"position error (mm)\nof {_point_text(point)}"
             axes[row, 0].set_ylabel("rotation error (rad)" if row else position_label)
             # Scale to the samples: a diverging first-order line must not compress them.
             low, high = (mean - std).min(), (mean + std).max()
@@ -121,8 +125,9 @@ def draw_perturbation(
             save(figure, path)
 
 
-def _point_text(point_m: FloatArray) -> str:
-    return "({:.2f}, {:.2f}, {:.2f}) m".format(*(np.round(point_m, 2) + 0.0))
+def _point_text(point: ReferencePoint) -> str:
+    """Name the point, and say on a second line where it is."""
+    return point_label(point) + ("" if point.name == ROBOT_FRAME else f"\nat {point_place(point)}")
 
 
 def _band(panel: Axes, noise_mm: FloatArray, mean: FloatArray, std: FloatArray) -> None:

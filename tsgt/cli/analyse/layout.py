@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,8 +22,8 @@ from tsgt.analysis.design import (
     pose_covariances,
     station_arrangements,
 )
-from tsgt.cli.analyse.options import figure_option, read_layout, usable_layout
-from tsgt.cli.options import FiniteRange, json_option, path_type
+from tsgt.cli.analyse.options import figure_option, point_text, read_layout, usable_layout
+from tsgt.cli.options import FiniteRange, json_option, path_type, point_option, resolved_point
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.progress import progress
 from tsgt.config import IMU_NOISE, MasterConfig, load, parameters, scenario_parameters
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.design import Criterion
     from tsgt.config import ImuModelName
     from tsgt.geometry import FloatArray
-    from tsgt.model import Parameters, Vector3
+    from tsgt.model import Parameters, ReferencePoint, Vector3
 
 _DISTANCES_M = (25.0, 50.0, 100.0, 200.0, 400.0)
 _BEST = "best in the envelope"
@@ -105,14 +106,7 @@ class _Candidate:
     default="rotation",
     help="Accuracy to optimise.",
 )
-@click.option(
-    "--point",
-    "point_m",
-    type=(float, float, float),
-    metavar="X Y Z",
-    default=(0.0, 0.0, 0.0),
-    help="Point whose position accuracy counts, in the robot frame in m, for example of a sensor.",
-)
+@point_option("that of the scenario or configuration, else the robot's origin")
 @click.option(
     "--imu",
     "imu_class",
@@ -131,7 +125,7 @@ def layout_command(
     envelope: tuple[float, ...] | None,
     min_separation_mm: float,
     criterion: Criterion,
-    point_m: Vector3,
+    point: ReferencePoint | str | None,
     imu_class: ImuModelName | None,
     seed: int,
     figure: Path | None,
@@ -148,19 +142,16 @@ def layout_command(
     station alone, with two, and so on. Fewer than three prisms have this table only.
     """
     # Comparisons with NaN are false.
-    if not all(
-        abs(number_m) <= MAX_COORDINATE_M for number_m in (*(area or ()), *(envelope or ()), *point_m)
-    ):
-        raise click.UsageError(
-            f"--area, --envelope and --point need finite numbers, at most {MAX_COORDINATE_M:g} m"
-        )
+    if not all(abs(number_m) <= MAX_COORDINATE_M for number_m in (*(area or ()), *(envelope or ()))):
+        raise click.UsageError(f"--area and --envelope need finite numbers, at most {MAX_COORDINATE_M:g} m")
     setup = _setup(scenario_name, config_path, area, imu_class)
     known, places, source = setup.known, setup.places, setup.source
+    at = known.reference_point if point is None else resolved_point(point, known)
     slots = {prism: slot for slot, prism in enumerate(sorted({s.prism for s in known.stations}))}
     stations = tuple(
         Station(np.array(s.T_station1_station)[:3, 3], s.noise, slots[s.prism]) for s in known.stations
     )
-    robot_poses, point = RobotPoses.at(places), np.array(point_m)
+    robot_poses, point_m = RobotPoses.at(places), np.array(at.position_m)
     if setup.imu is not None and len(slots) < MIN_PRISMS:
         if layouts or envelope is not None or figure is not None:
             raise click.UsageError(
@@ -168,18 +159,18 @@ def layout_command(
             )
         positions = {prism.prism: prism.position_m for prism in known.prisms}
         layout = np.array([positions[prism] for prism in slots])
-        added = _by_stations(layout, stations, setup, setup.imu, point)
+        added = _by_stations(layout, stations, setup, setup.imu, point_m)
         if as_json:
-            print_json({"point_m": point.tolist(), "with_imu": _imu_keys(added)})
+            print_json({"reference_point": dataclasses.asdict(at), "with_imu": _imu_keys(added)})
         else:
-            _print_stations(added, point, source)
+            _print_stations(added, at, source)
         return
     wanted = {source: _tracked({p.prism: p.position_m for p in known.prisms}, slots, source)}
     for path in layouts:
         wanted[str(path)] = _tracked(read_layout(path), slots, path)
 
     def candidate(name: str, layout: FloatArray) -> _Candidate:
-        return _Candidate(name, layout, pose_covariances(layout, stations, robot_poses, point))
+        return _Candidate(name, layout, pose_covariances(layout, stations, robot_poses, point_m))
 
     candidates = [candidate(name, np.array(list(prisms.values()))) for name, prisms in wanted.items()]
     if envelope is not None:
@@ -190,24 +181,26 @@ def layout_command(
             criterion=criterion,
             stations=stations,
             robot_poses=robot_poses,
-            point_m=point,
+            point_m=point_m,
         )
         with progress("searching") as on_progress:
             found = optimal_layout(task, np.random.default_rng(seed), on_progress=on_progress)
         candidates.append(candidate(_BEST, found))
     candidates.sort(key=lambda c: c.figures.rotation_rad if criterion == "rotation" else c.figures.position_m)
     centre = places.mean(axis=0)
-    distances = {d: _by_arrangement(candidates[0], stations, centre, d, point) for d in _DISTANCES_M}
-    added = {} if setup.imu is None else _by_stations(candidates[0].layout, stations, setup, setup.imu, point)
+    distances = {d: _by_arrangement(candidates[0], stations, centre, d, point_m) for d in _DISTANCES_M}
+    added = (
+        {} if setup.imu is None else _by_stations(candidates[0].layout, stations, setup, setup.imu, point_m)
+    )
     if figure is not None:
         from tsgt.analysis.figures import draw_layouts
 
-        draw_layouts({c.name: c.covariance for c in candidates}, distances, point, figure)
+        draw_layouts({c.name: c.covariance for c in candidates}, distances, at, figure)
     if as_json:
         print_json(
             {
                 "by": criterion,
-                "point_m": point.tolist(),
+                "reference_point": dataclasses.asdict(at),
                 "stances": len(robot_poses.position_m),
                 "ranking": [each.name for each in candidates],
                 "layouts": {
@@ -222,13 +215,13 @@ def layout_command(
             }
         )
         return
-    _print(candidates, point, len(robot_poses.position_m))
+    _print(candidates, at, len(robot_poses.position_m))
     if envelope is not None:
         _print_best(next(c for c in candidates if c.name == _BEST), slots)
     _print_distances(candidates[0].name, distances)
     if added:
         click.echo()
-        _print_stations(added, point, candidates[0].name)
+        _print_stations(added, at, candidates[0].name)
 
 
 def _setup(
@@ -247,15 +240,18 @@ def _setup(
         known = parameters(load(config_path, MasterConfig))
         imu = known.imu
         if imu_class is not None:
-            imu = _imu(imu_class, (0.0, 0.0, 0.0) if imu is None else imu.position_m)
+            imu = ImuParameters(
+                position_m=(0.0, 0.0, 0.0) if imu is None else imu.position_m,
+                orientation_xyzw=(0.0, 0.0, 0.0, 1.0),
+                noise=IMU_NOISE[imu_class],
+            )
         return _Setup(known, imu, _places(area), route=False, source=str(config_path))
     scenario = find_scenario(scenario_name or "dynamic")
     if imu_class is not None:
         simulated = scenario.imu.model_copy(update={"model": imu_class})
         scenario = scenario.model_copy(update={"imu": simulated})
-    model = scenario.imu.model
-    imu = None if model == "none" else _imu(model, scenario.imu.position_m)
-    known = scenario_parameters(scenario)
+    known = scenario_parameters(scenario, imu=True)
+    imu = known.imu
     route_m = scenario.motion.route_m
     if area is None and route_m:
         return _Setup(known, imu, np.array(route_m), route=True, source=scenario.name)
@@ -264,23 +260,17 @@ def _setup(
     return _Setup(known, imu, places, route=False, source=scenario.name)
 
 
-def _imu(imu_class: ImuModelName, position_m: Vector3) -> ImuParameters:
-    return ImuParameters(
-        position_m=position_m, orientation_xyzw=(0.0, 0.0, 0.0, 1.0), noise=IMU_NOISE[imu_class]
-    )
-
-
 def _by_stations(
     layout: FloatArray,
     stations: tuple[Station, ...],
     setup: _Setup,
     imu: ImuParameters,
-    point: FloatArray,
+    point_m: FloatArray,
 ) -> dict[int, InertialAccuracy]:
     """Return the accuracy with the IMU and the first stations, by their number."""
     path = DrivenPath.through(setup.places, closed=not setup.route)
     return {
-        count: inertial_accuracy(layout, stations[:count], path, imu, point)
+        count: inertial_accuracy(layout, stations[:count], path, imu, point_m)
         for count in range(1, len(stations) + 1)
     }
 
@@ -318,11 +308,11 @@ def _by_arrangement(
     stations: tuple[Station, ...],
     centre: FloatArray,
     distance_m: float,
-    point: FloatArray,
+    point_m: FloatArray,
 ) -> dict[str, PoseAccuracy]:
     robot_poses = RobotPoses.at(centre[None])
     return {
-        name: PoseAccuracy.of(pose_covariances(candidate.layout, moved, robot_poses, point))
+        name: PoseAccuracy.of(pose_covariances(candidate.layout, moved, robot_poses, point_m))
         for name, moved in station_arrangements(stations, centre, distance_m).items()
     }
 
@@ -338,11 +328,10 @@ def _keys(figures: PoseAccuracy) -> dict[str, Any]:
     }
 
 
-def _print(candidates: Sequence[_Candidate], point: FloatArray, robot_poses: int) -> None:
-    x, y, z = point
+def _print(candidates: Sequence[_Candidate], point: ReferencePoint, robot_poses: int) -> None:
     click.echo(
         f"One measurement of each prism, the robot stationary: one sigma, root mean square over {robot_poses} places and\n"
-        f"headings, of the position of ({x:g}, {y:g}, {z:g}) m and of the rotation (mm, mrad)\n"
+        f"headings, of the position of {point_text(point)} and of the rotation (mm, mrad)\n"
     )
     rows = [
         [
@@ -363,11 +352,10 @@ def _imu_keys(added: Mapping[int, InertialAccuracy]) -> dict[str, Any]:
     }
 
 
-def _print_stations(added: Mapping[int, InertialAccuracy], point: FloatArray, name: str) -> None:
-    x, y, z = point
+def _print_stations(added: Mapping[int, InertialAccuracy], point: ReferencePoint, name: str) -> None:
     click.echo(
         f"With the IMU and the first stations, with {name}, driving through the area: one sigma, root mean square, of the\n"
-        f"position of ({x:g}, {y:g}, {z:g}) m and of the rotation, smoothed afterwards and live (mm, mrad)\n"
+        f"position of {point_text(point)} and of the rotation, smoothed afterwards and live (mm, mrad)\n"
     )
     rows = [
         [

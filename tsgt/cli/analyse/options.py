@@ -1,4 +1,4 @@
-"""Options of the studies: the prism layout and the figure."""
+"""What the studies share: the prism layout, the figure, and the text of a point."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from tsgt.cli.options import OutputFile
 from tsgt.cli.output import require_extra
 from tsgt.config import load_prism_layout
 from tsgt.errors import ConfigError, GeometryError
+from tsgt.estimation import point_label, point_place
 from tsgt.geometry import check_layout
+from tsgt.model import ROBOT_FRAME
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from tsgt.model import Vector3
+    from tsgt.model import ReferencePoint, Vector3
 
 
 class FigureFile(OutputFile):
@@ -59,3 +61,8 @@ def usable_layout(prisms: Mapping[int, Vector3], source: Path | str) -> Mapping[
 def read_layout(path: Path) -> Mapping[int, Vector3]:
     """Read a prism layout (set-up file); raises as :func:`usable_layout`."""
     return usable_layout(dict(sorted(load_prism_layout(path).positions_m.items())), path)
+
+
+def point_text(point: ReferencePoint) -> str:
+    """Return the label of a point, and where it is on the robot."""
+    return point_label(point) + ("" if point.name == ROBOT_FRAME else f" at {point_place(point)}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -9,17 +10,19 @@ import click
 import numpy as np
 
 from tsgt.analysis.design import Perturbation, equivalent_noise, first_order_sigmas, perturbation_study
-from tsgt.cli.analyse.options import figure_option, read_layout
-from tsgt.cli.options import FiniteRange, json_option, path_type
+from tsgt.cli.analyse.options import figure_option, point_text, read_layout
+from tsgt.cli.options import FiniteRange, json_option, path_type, point_option, resolved_point
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.progress import progress
-from tsgt.config import ScenarioConfig
+from tsgt.config import ScenarioConfig, scenario_parameters
+from tsgt.model import PrismPosition
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
     from tsgt.geometry import FloatArray
+    from tsgt.model import ReferencePoint
 
 _EQUIVALENT_SAMPLES = 100_000
 """Enough for three digits of the figures of one noise level."""
@@ -62,13 +65,7 @@ _PAPER = "The paper: 10 mm between prisms are 10 mm in position and 0.01 rad in 
     type=path_type,
     help="Prism layout (set-up file).  [default: that of the scenario dynamic, with the paper's distances]",
 )
-@click.option(
-    "--point",
-    "point_m",
-    type=(float, float, float),
-    metavar="X Y Z",
-    help="Point whose position error is studied, in the robot frame in m.  [default: centroid of the prisms]",
-)
+@point_option("centroid")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the noise.")
 @figure_option
 @json_option
@@ -79,7 +76,7 @@ def perturbation_command(
     samples: int,
     inter_prism_mm: float,
     prisms: Path | None,
-    point_m: tuple[float, float, float] | None,
+    point: ReferencePoint | str | None,
     seed: int,
     figure: Path | None,
     as_json: bool,
@@ -95,34 +92,36 @@ def perturbation_command(
         raise click.UsageError(
             f"{levels} noise levels, at most {_MAX_LEVELS} are allowed: increase --step-mm"
         )
-    if point_m is not None and not np.isfinite(point_m).all():
-        raise click.UsageError("--point needs finite numbers")
-    known = _default_layout() if prisms is None else read_layout(prisms)
-    layout = np.array(list(known.values()))
-    point = layout.mean(axis=0) if point_m is None else np.array(point_m)
+    parameters = scenario_parameters(ScenarioConfig())
+    if prisms is not None:
+        wanted = tuple(PrismPosition(prism=p, position_m=place) for p, place in read_layout(prisms).items())
+        parameters = dataclasses.replace(parameters, prisms=wanted)
+    at = resolved_point("centroid" if point is None else point, parameters)
+    known = {prism.prism: prism.position_m for prism in parameters.prisms}
+    layout, point_m = np.array(list(known.values())), np.array(at.position_m)
     random = np.random.default_rng(seed)
     with progress("perturbing") as on_progress:
         study = perturbation_study(
             layout,
             [1e-3 * step_mm * level for level in range(levels)],
             samples=samples,
-            point_m=point,
+            point_m=point_m,
             random=random,
             on_progress=on_progress,
         )
     as_measured = equivalent_noise(
-        layout, inter_prism_mm / 1e3, samples=_EQUIVALENT_SAMPLES, point_m=point, random=random
+        layout, inter_prism_mm / 1e3, samples=_EQUIVALENT_SAMPLES, point_m=point_m, random=random
     )
-    per_mm = first_order_sigmas(layout, 1e-3, point_m=point)
+    per_mm = first_order_sigmas(layout, 1e-3, point_m=point_m)
     if figure is not None:
         from tsgt.analysis.figures import draw_perturbation
 
-        draw_perturbation(study, per_mm, point, [figure])
+        draw_perturbation(study, per_mm, at, [figure])
     if as_json:
         print_json(
             {
                 "prisms": known,
-                "point_m": point.tolist(),
+                "reference_point": dataclasses.asdict(at),
                 "samples": samples,
                 "seed": seed,
                 "at_mm": {f"{1e3 * each.noise_m:g}": _keys(each) for each in study},
@@ -135,11 +134,7 @@ def perturbation_command(
         )
         return
     _print(study, samples)
-    _print_equivalent(as_measured, per_mm, point)
-
-
-def _default_layout() -> dict[int, tuple[float, float, float]]:
-    return {prism.prism: prism.position_m for prism in ScenarioConfig().prisms}
+    _print_equivalent(as_measured, per_mm, at)
 
 
 def _keys(found: Perturbation) -> dict[str, Any]:
@@ -182,7 +177,9 @@ def _spreads(mean: FloatArray, std: FloatArray) -> list[str]:
     return [f"{round(1e3 * m, 1) + 0:.1f} ± {1e3 * s:.1f}" for m, s in zip(mean, std, strict=True)]
 
 
-def _print_equivalent(found: Perturbation, per_mm: tuple[FloatArray, FloatArray], point: FloatArray) -> None:
+def _print_equivalent(
+    found: Perturbation, per_mm: tuple[FloatArray, FloatArray], point: ReferencePoint
+) -> None:
     noise_mm = 1e3 * found.noise_m
     click.echo(
         f"\nA mean error of {1e3 * found.inter_prism_mean_m:g} mm between prisms corresponds to noise of {noise_mm:.2f} mm "
@@ -205,8 +202,7 @@ def _print_equivalent(found: Perturbation, per_mm: tuple[FloatArray, FloatArray]
     axes = ("x", "y", "z")
     header = ["", "mean norm", *(f"mean |{a}|" for a in axes), *(f"std {a}" for a in axes)]
     print_table([*header, *(f"1st order {a}" for a in axes)], rows)
-    where = ", ".join(f"{round(float(value), 3) + 0:.3f}" for value in point)
-    click.echo(f"\nThe position is that of the point ({where}) m in the robot frame. {_PAPER}")
+    click.echo(f"\nThe position is that of {point_text(point)}. {_PAPER}")
 
 
 def _mm(values: FloatArray) -> list[float]:

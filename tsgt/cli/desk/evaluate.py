@@ -85,7 +85,7 @@ LISTED_OUTLIERS = 10
     type=path_type,
     help="Reference trajectory: TUM, in the frame of station 1.",
 )
-@point_option
+@point_option()
 @reference_point_option
 @click.option(
     "--align",

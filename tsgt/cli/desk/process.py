@@ -64,7 +64,7 @@ FORMATS = {".tum": "tum", ".jsonl": "jsonl", ".json": "jsonl", ".csv": "csv"}
 )
 @frames_option
 @prisms_option
-@point_option
+@point_option()
 @click.option(
     "--format",
     "format_name",

@@ -17,7 +17,7 @@ from click.core import ParameterSource
 
 from tsgt.analysis.formats import tum_lines
 from tsgt.cli.model_options import add_options, model_option
-from tsgt.cli.options import POINT_METAVAR, RECORDING_SUFFIXES, OutputFile, PointType, json_option
+from tsgt.cli.options import RECORDING_SUFFIXES, OutputFile, json_option, point_option, resolved_point
 from tsgt.cli.output import CHECK_FAILED, numbers, print_json, print_table, require_new_file
 from tsgt.cli.progress import progress
 from tsgt.cli.simulate.figures import figures
@@ -30,6 +30,7 @@ from tsgt.config import (
     ScenarioRadioConfig,
     SimulatedImu,
     SuperframeMasterConfig,
+    scenario_parameters,
 )
 from tsgt.errors import OutputFileError, TsgtError
 from tsgt.estimation import point_label, reference_point_text
@@ -136,13 +137,7 @@ protocol_option = click.option(
         help="Estimator of the master.  [default: that of the scenario]",
     ),
     model_option(SimulationOptions, "seed"),
-    click.option(
-        "--point",
-        type=PointType(),
-        metavar=POINT_METAVAR,
-        help="Point of the robot whose poses are given: position in m and quaternion in the robot frame.  "
-        "[default: that of the scenario, the robot's origin]",
-    ),
+    point_option("that of the scenario, else the robot's origin"),
     click.option(
         "--output", type=OutputFile(*RECORDING_SUFFIXES), help="Write the master's recording (.jsonl)."
     ),
@@ -163,7 +158,7 @@ def simulate_command(
     restart_texts: tuple[str, ...],
     faults_text: str,
     estimator: str | None,
-    point: ReferencePoint | None,
+    point: ReferencePoint | str | None,
     output: Path | None,
     truth: Path | None,
     as_json: bool,
@@ -194,7 +189,8 @@ def simulate_command(
         pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
         scenario = scenario.model_copy(update={"pipeline": pipeline})
     if point is not None:
-        config = ReferencePointConfig(**dataclasses.asdict(point))
+        known = scenario_parameters(scenario, imu=True)
+        config = ReferencePointConfig(**dataclasses.asdict(resolved_point(point, known)))
         scenario = scenario.model_copy(update={"reference_point": config})
     station_numbers = tuple(station.station for station in scenario.stations)
     for number in station_numbers:

@@ -77,9 +77,9 @@ def test_layout_and_point_change_the_result(tsgt: Tsgt, small: Path) -> None:
     """A layout half as wide rotates more, and the origin, a metre below, moves with it."""
     arguments = ("analyse", "perturbation", "--noise-mm-max", 4, "--json")
     usual = tsgt(*arguments).json()
-    found = tsgt(*arguments, "--prisms", small, "--point", 0, 0, 0).json()
+    found = tsgt(*arguments, "--prisms", small, "--point", "robot").json()
     assert found["prisms"]["3"] == [0.0, 0.2, 1.1]
-    assert found["point_m"] == [0, 0, 0]
+    assert found["reference_point"]["position_m"] == [0, 0, 0]
     four, wide = found["at_mm"]["4"], usual["at_mm"]["4"]
     assert four["rotation_norm_mean_rad"] > 1.5 * wide["rotation_norm_mean_rad"]
     assert four["position_norm_mean_mm"] > 3 * wide["position_norm_mean_mm"]
@@ -91,7 +91,7 @@ def test_layout_and_point_change_the_result(tsgt: Tsgt, small: Path) -> None:
         ("--step-mm", 0),
         ("--samples", 1),
         ("--noise-mm-max", "nan"),
-        ("--point", "nan", 0, 0),
+        ("--point", "nan,0,0"),
         ("--step-mm", 1e-3),
         ("--figure", "study.gif"),
         ("--figure", "/nowhere/study.png"),

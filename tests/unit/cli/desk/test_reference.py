@@ -86,6 +86,16 @@ def test_every_table_of_errors_names_its_points(tsgt: Tsgt, recording: Path, tmp
     assert "at lidar is" in verdict
 
 
+def test_unknown_point_of_the_reference_is_an_error(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """That names its own option, not that of the poses."""
+    reference = tmp_path / "truth.tum"
+    reference.write_text("1600000000 0 0 0 0 0 0 1\n1600000100 0 0 0 0 0 0 1\n", encoding="utf-8")
+    arguments = ("--no-held-out", "--reference", reference, "--reference-point", "lidar")
+    outcome = tsgt("evaluate", recording, *arguments)
+    assert outcome.code == 2
+    assert "--reference-point: there is no point 'lidar'; there are robot, centroid" in outcome.err
+
+
 def test_reference_of_another_day_is_an_error(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
     """The error names both time spans; no figures are printed."""
     reference = tmp_path / "other.tum"

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 
 from tsgt.analysis.evaluation import read_tum
+from tsgt.cli.simulate import command
+from tsgt.errors import TsgtError
 from tsgt.estimation import parse_reference_point
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from harness.cli import Tsgt
+
+    from tsgt.config import ScenarioConfig
 
 LIDAR = "lidar=0.8,-0.3,3.0,0.1,-0.2,0.3,0.9273618495495704"
 
@@ -52,3 +56,23 @@ def test_point_of_the_robot_cannot_be_another(tsgt: Tsgt) -> None:
     outcome = tsgt("simulate", "--point", "robot=1,0,0", "--duration", 5)
     assert outcome.code == 2
     assert "robot is the robot frame itself; give another point another name" in outcome.err
+
+
+def test_point_is_given_by_its_name(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mission has the IMU of the scenario as its reference point."""
+    points = []
+
+    def record(scenario: ScenarioConfig, *_: object) -> None:
+        points.append(scenario.reference_point.point())
+        raise TsgtError("not run")
+
+    monkeypatch.setattr(command, "_simulate", record)
+    tsgt("simulate", "dynamic", "--imu", "industrial", "--point", "imu")
+    assert [(point.name, point.position_m) for point in points] == [("imu", (0.21, -0.12, 0.43))]
+
+
+def test_unknown_name_is_an_error(tsgt: Tsgt) -> None:
+    """With the names that there are; this robot has no IMU."""
+    outcome = tsgt("simulate", "--point", "imu", "--duration", 5)
+    assert outcome.code == 2
+    assert "--point: there is no point 'imu'; there are robot, centroid" in outcome.err

@@ -14,6 +14,7 @@ from tsgt.geometry.inertial import fit_inertial_trajectory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -181,3 +182,17 @@ def gaps(samples: InertialSamples, start_s: float, end_s: float) -> list[UnusedI
         UnusedInterval(float(max(ends_s[row], start_s)), float(min(begins_s[row], end_s)), "gap")
         for row in rows
     ]
+
+
+def imu_keys(used: ImuUse | None, problem: str) -> dict[str, Any]:
+    """Return for ``--json`` how the IMU was used; null where it was not, for a reason or without one."""
+    if used is None:
+        return {"imu": None} | ({"imu_problem": problem} if problem else {})
+    return {
+        "imu": {
+            "stations": list(used.stations),
+            "samples": len(used.samples),
+            "unused_s": used.unused_s,
+            "tilt_sigma_mrad": 1e3 * used.fit.tilt_sigma_rad,
+        }
+    }

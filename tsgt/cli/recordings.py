@@ -205,21 +205,6 @@ def motion_keys(found: SmoothedRecording) -> dict[str, Any]:
     }
 
 
-def imu_keys(found: SmoothedRecording) -> dict[str, Any]:
-    """Return for ``--json`` how the IMU was used; null where it was not, for a reason or without one."""
-    if found.imu is None:
-        return {"imu": None} | ({"imu_problem": found.imu_problem} if found.imu_problem else {})
-    used = found.imu
-    return {
-        "imu": {
-            "stations": list(used.stations),
-            "samples": len(used.samples),
-            "unused_s": used.unused_s,
-            "tilt_sigma_mrad": 1e3 * used.fit.tilt_sigma_rad,
-        }
-    }
-
-
 def imu_text(found: SmoothedRecording) -> str | None:
     """Return in words how the IMU was used; None without one."""
     if found.imu is None:

@@ -52,7 +52,8 @@ def normalised_prediction_errors(
     """
     states, covariance = trajectory.at(test.time_s)
     linearised = linearise(test, states, np.arange(len(test)))
-    jacobian = linearised.jacobian
+    # Position and rotation only: the states are at the measurements' times.
+    jacobian, covariance = linearised.jacobian[:, :, :6], covariance[:, :6, :6]
     expected = np.einsum("mij,mjk,mik->mi", jacobian, covariance, jacobian, optimize=True) + np.diagonal(
         linearised.covariance(test), axis1=1, axis2=2
     )

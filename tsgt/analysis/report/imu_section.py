@@ -69,7 +69,7 @@ def imu_section(f: Findings, axis: TimeAxis) -> Section | None:
     biases = _Biases.of(imu, f.continuous.origin_ns)
     rows = [
         ("sample rate", f"{format_number(numbers['rate_hz'])} Hz"),
-        ("samples", str(numbers["samples"])),
+        ("samples", str(len(imu.samples))),
         ("gaps", f"{numbers['gaps']}, {format_number(numbers['missing_s'], 2)} s in total"),
         *([] if f.log.imu is None else [("saturated samples", str(f.log.imu.saturated))]),
         ("time without use", f"{format_number(imu.unused_s)} s"),
@@ -101,13 +101,10 @@ def imu_numbers(f: Findings) -> dict[str, Any]:
     biases = _Biases.of(imu, continuous.origin_ns)
     middle, sigma = np.median(biases.values, axis=0), np.median(biases.sigmas, axis=0)
     return {
-        "stations": list(imu.stations),
-        "samples": len(samples),
         "rate_hz": float(1.0 / np.median(samples.duration_s)),
         "gaps": int(missing.sum()),
         "missing_s": float((between_s - samples.duration_s[1:])[missing].sum()),
         "saturated": None if f.log.imu is None else f.log.imu.saturated,
-        "unused_s": imu.unused_s,
         "gyro_bias_dps": middle[:3].tolist(),
         "gyro_bias_sigma_dps": sigma[:3].tolist(),
         "accelerometer_bias_mps2": middle[3:].tolist(),

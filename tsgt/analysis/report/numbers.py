@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.evaluation import noise_scales_by_axis
+from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.refinement import refinement_keys
 from tsgt.analysis.report.calibration import calibration_numbers
@@ -89,8 +90,9 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
             },
             "outliers": [dataclasses.asdict(outlier) for outlier in f.outliers],
         }
+        found |= imu_keys(f.continuous.imu, f.continuous.imu_problem)
         if f.continuous.imu is not None:
-            found["imu"] = imu_numbers(f)
+            found["imu_quality"] = imu_numbers(f)
     if f.reference_errors:
         found["estimators"] = {name: _compared(f, name) for name in f.reference_errors}
         found |= found["estimators"].get(f.recording.parameters.pipeline.estimator, {})

@@ -17,6 +17,7 @@ from tsgt.analysis.evaluation import (
     outliers,
     residual_statistics,
 )
+from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.processing import process
 from tsgt.analysis.refinement import refinement_keys, refinement_text
 from tsgt.analysis.smoothing import smooth_recording
@@ -37,7 +38,6 @@ from tsgt.cli.recordings import (
     duration_s,
     estimator_option,
     frames_option,
-    imu_keys,
     imu_options,
     imu_text,
     load,
@@ -209,7 +209,7 @@ def evaluate(
                 **({} if predicted is None else {"held_out_mm": _held_out_keys(predicted)}),
                 **refinement_keys(continuous.refinement, continuous.parameters),
                 **motion_keys(continuous),
-                **imu_keys(continuous),
+                **imu_keys(continuous.imu, continuous.imu_problem),
                 "residuals": {
                     station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
                     for station, axes in residuals.items()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tsgt.analysis.formats import pose_csv, tum_lines, valid_rows
+from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.processing import process as process_recording
 from tsgt.analysis.refinement import refinement_keys, refinement_text
 from tsgt.analysis.smoothing import smooth_recording
@@ -27,7 +28,6 @@ from tsgt.cli.recordings import (
     duration_s,
     estimator_option,
     frames_option,
-    imu_keys,
     imu_options,
     imu_text,
     load,
@@ -141,7 +141,7 @@ def process(
             if continuous is None
             else {
                 **motion_keys(continuous),
-                **imu_keys(continuous),
+                **imu_keys(continuous.imu, continuous.imu_problem),
                 **refinement_keys(continuous.refinement, continuous.parameters),
                 "rest_s": continuous.rest_s,
             }

@@ -100,7 +100,7 @@ def test_report_shows_the_imu(tmp_path: Path) -> None:
     recording = imu_recording(shaken_drive(22.0))
     write(path, recording)
     found = collect_findings(recording, path, reference=None, with_held_out=False, refine="off")
-    numbers = report_numbers(found)["imu"]
+    numbers = report_numbers(found)["imu_quality"]
     assert numbers["rate_hz"] == pytest.approx(200.0)
     assert numbers["gaps"] == 0
     innovation = numbers["rotation_innovation_deg"]

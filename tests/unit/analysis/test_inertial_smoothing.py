@@ -61,6 +61,7 @@ def test_two_stations_without_samples_are_an_error() -> None:
         smooth(recording)
 
 
+@pytest.mark.slow
 def test_imu_that_contradicts_the_measurements_is_left_out() -> None:
     """Poses are those of the stations alone, with the reason."""
     x, y, z, w = (Rotation.from_quat(IMU.orientation_xyzw) * Rotation.from_rotvec([0.0, 0.08, 0.0])).as_quat()
@@ -82,6 +83,7 @@ def test_samples_of_another_day_are_an_error_of_two_stations() -> None:
         smooth(replace(recording, imu_samples=later))
 
 
+@pytest.mark.slow
 def test_gap_of_the_samples_has_the_poses_of_the_stations_alone() -> None:
     """No valid pose there is worse than without an IMU."""
     recording = imu_recording(DRIVE)

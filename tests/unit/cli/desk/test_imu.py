@@ -41,6 +41,7 @@ def positions(path: Path) -> np.ndarray:
     return np.loadtxt(path)[:, :4]
 
 
+@pytest.mark.slow
 def test_imported_samples_are_worth_the_recorded_ones(tsgt: Tsgt, folder: Path, tmp_path: Path) -> None:
     """With the file of a calibration, which describes the IMU."""
     done = tsgt("process", folder / "with.jsonl", "--output", tmp_path / "a.tum")
@@ -72,6 +73,7 @@ def test_two_stations_need_the_imu(
     assert message in done.err
 
 
+@pytest.mark.slow
 def test_export_gives_poses_of_the_imu_by_its_name(tsgt: Tsgt, folder: Path, tmp_path: Path) -> None:
     """The points of the robot have names."""
     output = tmp_path / "imu.tum"

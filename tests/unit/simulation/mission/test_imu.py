@@ -38,6 +38,7 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> MissionResult:
     return run_mission(folder, WITH, duration_s=8.0, protocol=SUPERFRAME, seed=0)
 
 
+@pytest.mark.slow
 def test_recording_holds_the_samples_at_their_times(mission: MissionResult) -> None:
     """All samples are recorded unchanged; their stamps are late by the latency, to a fifth of a millisecond."""
     assert check_invariants(mission) == []

@@ -247,6 +247,7 @@ class FixedLagSmoother(MeasurementWindow):
             system.whitened[is_new], knot_index[is_new], system.gradient, solve_system
         )
         weights = self._weigh(nis, sequential_nis)
+        system.weights[is_new] = weights
         add_measurements(
             system.whitened[is_new], weights, knot_index[is_new], system.diagonal, system.gradient
         )

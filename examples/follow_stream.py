@@ -20,6 +20,11 @@ def follow(path: str) -> None:
                 sys.exit(
                     f"the stream has protocol version {record['protocol']}, this program supports version 1"
                 )
+            if record["type"] == "setup":
+                names = ", ".join(
+                    f"station {station['id']} at {station['position_m']}" for station in record["stations"]
+                )
+                print(f"poses of {record['child_frame']} in {record['frame']}; {names}", flush=True)
             if record["type"] == "event":
                 print(f"event: {record['message']}", flush=True)
             # Ignore all other types, also those of later versions.

@@ -21,6 +21,8 @@ from tsgt.recording import (
     ImuStatus,
     PoseRecord,
     RecordingHeader,
+    SetupGeofence,
+    SetupRecord,
     StationShare,
     StationStatus,
     StatusRecord,
@@ -38,6 +40,18 @@ PARAMETERS = Parameters(
         PrismPosition(prism=number, position_m=position)
         for number, position in ((1, (-0.5, 0.0, 1.0)), (2, (0.5, 0.0, 1.0)), (3, (0.0, 0.5, 1.5)))
     ),
+)
+SETUP = SetupRecord.of(
+    PARAMETERS,
+    START,
+    protocol="superframe",
+    authenticated=True,
+    geofences=[
+        SetupGeofence(
+            name="site", allowed_side="inside", polygon_m=((0.0, 0.0), (50.0, 0.0), (0.0, 50.0)), margin_m=1.0
+        )
+    ],
+    recording="master-20261121T055100Z.jsonl",
 )
 POINT = PointMeasurement(
     station=2, prism=2, sequence=0, stamp_ns=START, received_ns=START + SECOND, position_m=(1.0, -2.5, 1 / 3)

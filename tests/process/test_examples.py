@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from harness.records import EVENT, HELLO, NO_POSE, POSE, measurement
+from harness.records import EVENT, HELLO, NO_POSE, POSE, SETUP, measurement
 
 from tsgt.recording import encode_line
 
@@ -36,11 +36,12 @@ def followed(tmp_path: Path, lines: list[bytes]) -> tuple[int, list[str]]:
 
 def test_example_follows_the_stream(tmp_path: Path) -> None:
     """The example uses the standard library only and ignores unknown records."""
-    records = [HELLO, measurement(0), POSE, NO_POSE, EVENT]
+    records = [HELLO, SETUP, measurement(0), POSE, NO_POSE, EVENT]
     lines = [*map(encode_line, records), b'{"type":"weather"}']
     assert followed(tmp_path, lines) == (
         0,
         [
+            f"poses of robot in station1; {', '.join(f'station {n} at [0.0, 0.0, 0.0]' for n in (1, 2, 3))}",
             f"{POSE.stamp_ns} ns: 1.000 2.000 -0.100 m, sigma of x 0.0010 m",
             "no pose: outage",
             "event: lost 7 lines",

@@ -79,7 +79,7 @@ def test_master_streams_without_radio_and_ends_on_sigterm(
         assert time.monotonic() - signalled_s < 1.0
     (recording,) = (config.parent / "recordings").iterdir()
     types = [line.type for line in read_lines(recording)]
-    assert types[:3] == ["recording", "parameters", "event"]
+    assert types[:4] == ["recording", "parameters", "setup", "event"]
     assert "status" in types
     assert daemon.stderr is not None
     logged = [json.loads(line)["event"] for line in daemon.stderr]

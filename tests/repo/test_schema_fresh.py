@@ -17,6 +17,7 @@ from harness.records import (
     PARAMETERS,
     POINT,
     POSE,
+    SETUP,
     STATUS,
     measurement,
 )
@@ -26,7 +27,7 @@ from tsgt.master import schema
 from tsgt.recording import encode_line
 
 ROOT = Path(__file__).parents[2]
-RECORDS = [HELLO, measurement(0), POINT, POSE, NO_POSE, CLOCK, STATUS, EVENT, HEADER, PARAMETERS]
+RECORDS = [HELLO, SETUP, measurement(0), POINT, POSE, NO_POSE, CLOCK, STATUS, EVENT, HEADER, PARAMETERS]
 
 
 @pytest.fixture(scope="module")

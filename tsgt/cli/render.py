@@ -14,6 +14,8 @@ from tsgt.recording import (
     HelloRecord,
     ImuStatus,
     PoseRecord,
+    SetupRecord,
+    SetupStation,
     StationStatus,
     StatusRecord,
     ValidityLimits,
@@ -42,6 +44,8 @@ def render(kind: str, line: bytes) -> str | None:
     match kind:
         case "hello":
             return _hello(decode(HelloRecord, line))
+        case "setup":
+            return _setup(decode(SetupRecord, line))
         case "measurement":
             return _polar(decode(PolarMeasurement, line))
         case "point":
@@ -80,6 +84,30 @@ def _limits(limits: ValidityLimits) -> str:
         if position_m is not None and rotation_rad is not None
     ]
     return f" Limits at {limits.reference_point}: {'; '.join(parts)}." if parts else ""
+
+
+def _setup(setup: SetupRecord) -> str:
+    parts = [
+        f"{clock_time(setup.stamp_ns)}  setup  {setup.child_frame} in {setup.frame}, {setup.estimator}, {setup.rate_hz:g} Hz",
+        *map(_setup_station, setup.stations),
+        *(f"geofence {fence.name}" for fence in setup.geofences),
+        *(["IMU"] if setup.imu else []),
+    ]
+    if setup.protocol is not None:
+        parts.append(f"{setup.protocol}{'' if setup.authenticated else ', not authenticated'}")
+    if setup.recording is not None:
+        parts.append(f"recorded in {setup.recording}")
+    return "; ".join(parts)
+
+
+def _setup_station(station: SetupStation) -> str:
+    text = f"station {station.id} on prism {station.prism} at {_vector(station.position_m)} m"
+    if station.covariance is None or not any(station.covariance):
+        return text
+    sigmas_mm = " ".join(
+        f"{1e3 * math.sqrt(max(0.0, station.covariance[7 * axis])):.1f}" for axis in range(3)
+    )
+    return f"{text} (sigmas {sigmas_mm} mm)"
 
 
 def _polar(polar: PolarMeasurement) -> str:

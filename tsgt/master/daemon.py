@@ -42,6 +42,8 @@ from tsgt.recording import (
     PoseRecord,
     RecordingHeader,
     RecordingWriter,
+    SetupGeofence,
+    SetupRecord,
     ValidityLimits,
     encode_line,
     new_recording_path,
@@ -137,6 +139,7 @@ async def run_master(
                     lambda: timeline.unix_ns(clock.monotonic_ns()),
                     lambda work: checks.submit(work).result,
                 )
+                publisher.put(_setup_record(config, parameters, start_ns, path.name, dependencies.key))
                 link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)
                 imu = _imu(config, timeline, publisher, dependencies)
                 master = _Master(clock, timeline, publisher, link, imu)
@@ -157,6 +160,27 @@ async def run_master(
             service.sd_notify("STOPPING=1")
             recorder.close()
             log.info("master_stopped")
+
+
+def _setup_record(
+    config: MasterConfig, parameters: Parameters, stamp_ns: int, recording: str, key: bytes | None
+) -> SetupRecord:
+    return SetupRecord.of(
+        parameters,
+        stamp_ns,
+        protocol=config.protocol.kind,
+        authenticated=key is not None,
+        geofences=(
+            SetupGeofence(
+                name=fence.name,
+                allowed_side=fence.allowed_side,
+                polygon_m=fence.polygon_m,
+                margin_m=fence.margin_m,
+            )
+            for fence in config.geofences
+        ),
+        recording=recording,
+    )
 
 
 class Link(Protocol):

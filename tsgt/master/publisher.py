@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tsgt.master.station_events import StationEventDetector
     from tsgt.master.statistics import Statistics
     from tsgt.model import ImuSamples, Measurement, Parameters
-    from tsgt.recording import BeaconRecord, ClockRecord, ImuStatus, StatusRecord
+    from tsgt.recording import BeaconRecord, ClockRecord, ImuStatus, SetupRecord, StatusRecord
 
 
 class Observer:
@@ -139,7 +139,7 @@ class Publisher:
         """Record samples of the IMU, in the order of arrival among all other lines, after the poses due before them."""
         self._send(self._estimator.imu_samples(samples), samples.received_ns)
 
-    def put(self, record: StatusRecord | EventRecord | ClockRecord | BeaconRecord) -> None:
+    def put(self, record: SetupRecord | StatusRecord | EventRecord | ClockRecord | BeaconRecord) -> None:
         """Publish a record after the poses that are due by its stamp."""
         self._send([*self._estimator.advance(record.stamp_ns), record], record.stamp_ns)
 

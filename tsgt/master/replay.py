@@ -13,6 +13,7 @@ from tsgt.recording import (
     ClockRecord,
     EventRecord,
     HelloRecord,
+    SetupRecord,
     StatusRecord,
     ValidityLimits,
     decode_line,
@@ -28,13 +29,14 @@ if TYPE_CHECKING:
     from tsgt.master.stream_server import StreamServer
     from tsgt.recording import Line
 
-_Arrival = Measurement | ImuSamples | StatusRecord | EventRecord | ClockRecord | BeaconRecord
+_Arrival = Measurement | ImuSamples | SetupRecord | StatusRecord | EventRecord | ClockRecord | BeaconRecord
 
 # Records that arrived at the master; headers and parameters are not on the stream, nor are the samples of an IMU.
 _ARRIVALS: dict[str, type[_Arrival]] = {
     "measurement": PolarMeasurement,
     "point": PointMeasurement,
     "imu": ImuSamples,
+    "setup": SetupRecord,
     "clock": ClockRecord,
     "beacon": BeaconRecord,
     "status": StatusRecord,
@@ -51,15 +53,18 @@ def replayed(
     """Repeat the calls of the live master, in the same order with the same instants.
 
     Corrupt lines are passed to ``on_problem`` and skipped if ``keep_going`` is set; else they raise. Yields the instant
-    of an arrival on the master's Unix clock in ns, and the stream's lines that follow from it. Raises RecordingError if
+    of an arrival on the master's Unix clock in ns, and the stream's lines that follow from it. A session without its
+    ``setup`` gets the one of its parameters. Raises RecordingError if
     the recording cannot be read, or measurements precede all parameters.
     """
     estimator: LiveEstimator | None = None
+    unannounced: Parameters | None = None  # of a session whose set-up is not among the lines so far
     missing_poses = 0
     for line in read_lines(path, imu=True, keep_going=keep_going, on_problem=on_problem):
         try:
             if line.type == "parameters":
-                estimator, missing_poses = LiveEstimator(decode_line(Parameters, line, path)), 0
+                unannounced = decode_line(Parameters, line, path)
+                estimator, missing_poses = LiveEstimator(unannounced), 0
             elif line.type == "pose" and estimator is not None:
                 # A pose that was not replayed yet was due by the timer.
                 missing_poses += 1
@@ -78,6 +83,10 @@ def replayed(
                     estimator, decode_line(_ARRIVALS[line.type], line, path), line
                 )
                 missing_poses -= poses_made
+                if unannounced is not None:
+                    if line.type != "setup":  # recorded by an older version, or imported
+                        lines.insert(0, encode_line(SetupRecord.of(unannounced, now_ns)))
+                    unannounced = None
                 yield now_ns, lines
         except CorruptLineError as problem:
             if not keep_going:
@@ -100,7 +109,7 @@ def _arrival(
     line: Line,
 ) -> tuple[int, list[bytes], int]:
     """Pass on an arrival; return its instant, the lines that follow from it, and the number of poses among them."""
-    if isinstance(record, StatusRecord | EventRecord | ClockRecord | BeaconRecord):
+    if isinstance(record, SetupRecord | StatusRecord | EventRecord | ClockRecord | BeaconRecord):
         now_ns = record.stamp_ns
         records: list[object] = [*estimator.advance(now_ns), record]
     elif isinstance(record, ImuSamples):

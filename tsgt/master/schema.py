@@ -28,6 +28,11 @@ PAGES: dict[Path, tuple[type, ...]] = {
     Path("docs/reference/stream.md"): (
         recording.HelloRecord,
         recording.ValidityLimits,
+        recording.SetupRecord,
+        model.ReferencePoint,
+        recording.SetupStation,
+        recording.SetupPrism,
+        recording.SetupGeofence,
         model.PolarMeasurement,
         model.PointMeasurement,
         recording.PoseRecord,

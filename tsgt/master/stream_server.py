@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Self
 
 import structlog
 
-from tsgt.recording import EventRecord, encode_line
+from tsgt.recording import SETUP_START, EventRecord, encode_line
 from tsgt.service import UnixListener
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ log = structlog.get_logger()
 class StreamServer:
     """Serves lines to every reader of a UNIX socket; an async context manager.
 
-    A reader gets the greeting and then what is published. What readers send is ignored. On exit, readers have
+    A reader gets the greeting, the newest ``setup`` that was published, and then what is published. What readers send is ignored. On exit, readers have
     :data:`CLOSE_TIMEOUT_S` to take their queues. Entering raises StreamError if another program
     serves the socket, or it cannot be created.
 
@@ -62,7 +62,8 @@ class StreamServer:
         unix_now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._path = path
-        self._hello = hello
+        self._greeting = hello + b"\n"
+        self._setup = b""
         self._mode = mode
         self._queue_lines = queue_lines
         self._unix_now_ns = unix_now_ns
@@ -111,6 +112,8 @@ class StreamServer:
     def publish(self, line: bytes) -> None:
         """Send a line, without line end, to all readers; never waits, slow readers lose lines."""
         data = line + b"\n"
+        if line.startswith(SETUP_START):
+            self._setup = data
         for reader in self._readers:
             reader.send(data)
 
@@ -140,7 +143,9 @@ class StreamServer:
     def _new_reader(self) -> asyncio.Protocol:
         if self._closing:
             return _RejectedConnection()
-        return _Reader(self._readers, self._changed, self._hello, self._queue_lines, self._unix_now_ns)
+        return _Reader(
+            self._readers, self._changed, self._greeting + self._setup, self._queue_lines, self._unix_now_ns
+        )
 
 
 class _RejectedConnection(asyncio.Protocol):
@@ -157,13 +162,13 @@ class _Reader(asyncio.Protocol):
         self,
         readers: set[_Reader],
         changed: asyncio.Event,
-        hello: bytes,
+        greeting: bytes,
         queue_lines: int,
         unix_now_ns: Callable[[], int],
     ) -> None:
         self._readers = readers
         self._changed = changed
-        self._hello = hello
+        self._greeting = greeting
         self._queue: deque[bytes] = deque()
         self._queue_lines = queue_lines
         self._unix_now_ns = unix_now_ns
@@ -200,7 +205,7 @@ class _Reader(asyncio.Protocol):
             log.warning("reader_refused", readers=len(self._readers))
             self.abort()
             return
-        self._transport.write(self._hello + b"\n")
+        self._transport.write(self._greeting)
         self._readers.add(self)
         self._changed.set()
         log.info("reader_connected", readers=len(self._readers))

@@ -19,6 +19,13 @@ from tsgt.recording.format import (
 )
 from tsgt.recording.merged import MergedRecord
 from tsgt.recording.reader import Recording, load_recording, read_imu_samples, read_lines
+from tsgt.recording.setup_record import (
+    SETUP_START,
+    SetupGeofence,
+    SetupPrism,
+    SetupRecord,
+    SetupStation,
+)
 from tsgt.recording.stream_records import (
     PROTOCOL_VERSION,
     BeaconRecord,
@@ -40,6 +47,7 @@ __all__ = [
     "FORMAT_VERSION",
     "MAX_LINE_BYTES",
     "PROTOCOL_VERSION",
+    "SETUP_START",
     "BeaconRecord",
     "ClockRecord",
     "Degradation",
@@ -53,6 +61,10 @@ __all__ = [
     "Recording",
     "RecordingHeader",
     "RecordingWriter",
+    "SetupGeofence",
+    "SetupPrism",
+    "SetupRecord",
+    "SetupStation",
     "StationShare",
     "StationStatus",
     "StatusRecord",

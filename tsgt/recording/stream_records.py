@@ -28,7 +28,7 @@ from tsgt.model import (
 
 PROTOCOL_VERSION = 1
 
-CAPABILITIES = ("measurement", "point", "pose", "clock", "beacon", "status", "event")
+CAPABILITIES = ("setup", "measurement", "point", "pose", "clock", "beacon", "status", "event")
 
 Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]

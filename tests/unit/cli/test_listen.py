@@ -69,7 +69,7 @@ def test_every_record_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
     assert outcome.code == 0
     assert outcome.err == ""
     assert outcome.out.splitlines() == [
-        f"tsgt {HELLO.version}, stream protocol 1: measurement, point, pose, clock, beacon, status, event",
+        f"tsgt {HELLO.version}, stream protocol 1: setup, measurement, point, pose, clock, beacon, status, event",
         "22:13:20.000  station 1 prism 1  horizontal 5.7296 deg  zenith 85.9437 deg  30.0000 m  ok",
         "22:13:20.000  station 2 prism 2  1.000 -2.500 0.333 m  ok",
         POSE_TEXT,

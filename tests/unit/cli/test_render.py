@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.records import CLOCK, EVENT, IMU_STATUS, PARAMETERS, POSE, STATUS, measurement
+from harness.records import CLOCK, EVENT, IMU_STATUS, PARAMETERS, POSE, SETUP, STATUS, measurement
 from scipy.spatial.transform import Rotation
 
 from tsgt.cli.render import render, yaw_pitch_roll_deg
-from tsgt.model import PipelineParameters
-from tsgt.recording import HelloRecord, ValidityLimits, encode_line
+from tsgt.model import PipelineParameters, SetupCovariance
+from tsgt.recording import HelloRecord, SetupRecord, ValidityLimits, encode_line
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -50,6 +50,22 @@ def test_greeting_states_the_limits_of_both_kinds() -> None:
     text = render("hello", encode_line(HelloRecord(limits=linear)))
     assert text is not None
     assert "Limits" not in text
+
+
+def test_setup_names_stations_and_their_uncertainty() -> None:
+    """With fences, radio and recording."""
+    known = SetupCovariance(components=("station2.x", "station2.z"), matrix=((4e-6, 0.0), (0.0, 1e-6)))
+    parameters = replace(PARAMETERS, setup_covariance=known)
+    setup = SetupRecord.of(parameters, SETUP.stamp_ns, protocol="classic", authenticated=False)
+    text = render("setup", encode_line(setup))
+    assert text == (
+        "22:13:20.000  setup  robot in station1, continuous, 20 Hz; station 1 on prism 1 at 0.000 0.000 0.000 m; "
+        "station 2 on prism 2 at 0.000 0.000 0.000 m (sigmas 2.0 0.0 1.0 mm); "
+        "station 3 on prism 3 at 0.000 0.000 0.000 m; classic, not authenticated"
+    )
+    whole = render("setup", encode_line(SETUP))
+    assert whole is not None
+    assert whole.endswith("; geofence site; superframe; recorded in master-20261121T055100Z.jsonl")
 
 
 def test_degraded_pose_says_by_what() -> None:

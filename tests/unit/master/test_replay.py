@@ -16,7 +16,7 @@ from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import LiveEstimator
 from tsgt.master.replay import greeting, replay, replayed
 from tsgt.master.stream_server import StreamServer
-from tsgt.recording import RecordingWriter, ValidityLimits, encode_line
+from tsgt.recording import RecordingWriter, SetupGeofence, SetupRecord, ValidityLimits, encode_line
 from tsgt.simulation.kernel import VirtualClock
 
 if TYPE_CHECKING:
@@ -25,12 +25,16 @@ if TYPE_CHECKING:
     from harness.scene import Scene
 
 SCENE = stationary_scene()
+FENCE = SetupGeofence(
+    name="site", allowed_side="inside", polygon_m=((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)), margin_m=0.5
+)
+SETUP = encode_line(SetupRecord.of(SCENE.parameters, START, protocol="superframe", geofences=[FENCE]))
 
 
 def live_lines(path: Path, seconds: int = 3, *, scene: Scene = SCENE) -> list[bytes]:
     """Record a short live run, as a master does; return the lines that its readers got."""
     feed = LiveEstimator(scene.parameters)
-    lines: list[bytes] = []
+    lines = [encode_line(SetupRecord.of(scene.parameters, START, protocol="superframe", geofences=[FENCE]))]
     for step in range(seconds * 10):
         for station in (1, 2, 3):
             lines += map(encode_line, feed.measurement(scene.measure(station, step / 10)))
@@ -76,9 +80,9 @@ def test_poses_of_the_timer_are_replayed(tmp_path: Path) -> None:
         assert deadline_ns is not None
         records += feed.advance(deadline_ns)
     with RecordingWriter(path) as writer:
-        for record in (HEADER, SCENE.parameters, *records):
-            writer.write(record)
-    assert replayed_lines(path) == [encode_line(record) for record in records]
+        for line in (encode_line(HEADER), encode_line(SCENE.parameters), SETUP, *map(encode_line, records)):
+            writer.write_line(line)
+    assert replayed_lines(path) == [SETUP, *map(encode_line, records)]
 
 
 def test_unknown_keys_are_replayed(tmp_path: Path) -> None:
@@ -88,8 +92,9 @@ def test_unknown_keys_are_replayed(tmp_path: Path) -> None:
     with RecordingWriter(path) as writer:
         writer.write(HEADER)
         writer.write(SCENE.parameters)
+        writer.write_line(SETUP)
         writer.write_line(line)
-    assert replayed_lines(path) == [line]
+    assert replayed_lines(path) == [SETUP, line]
 
 
 def test_each_session_starts_with_a_new_estimator(tmp_path: Path) -> None:
@@ -98,6 +103,17 @@ def test_each_session_starts_with_a_new_estimator(tmp_path: Path) -> None:
     lines = live_lines(path)
     assert live_lines(path) == lines
     assert replayed_lines(path) == lines + lines
+
+
+def test_recording_without_setup_gets_that_of_its_parameters(tmp_path: Path) -> None:
+    """Those of older versions, and imports; in force since the first arrival."""
+    path = tmp_path / "run.jsonl"
+    first = SCENE.measure(1, 0.0)
+    with RecordingWriter(path) as writer:
+        for record in (HEADER, SCENE.parameters, first):
+            writer.write(record)
+    setup = SetupRecord.of(SCENE.parameters, first.received_ns)
+    assert replayed_lines(path) == [encode_line(setup), encode_line(first)]
 
 
 def test_measurement_before_parameters_is_an_error(tmp_path: Path) -> None:

@@ -116,6 +116,23 @@ async def test_every_reader_gets_every_line(path: Path) -> None:
             await client.close()
 
 
+async def test_new_readers_get_the_newest_setup(path: Path) -> None:
+    """After the greeting, before all other lines; readers that are there get it as any line."""
+    setups = [b'{"type":"setup","stamp_ns":1}', b'{"type":"setup","stamp_ns":2}']
+    async with StreamServer(path, HELLO) as server:
+        clients = [await Client.connect(path)]
+        for line_ in (*setups, line(7)):
+            server.publish(line_)
+        clients.append(await Client.connect(path))
+        server.publish(line(8))
+        for client, stamps in zip(clients, ([1, 2], [2]), strict=True):
+            assert [(await client.record())["stamp_ns"] for _ in stamps] == stamps
+        assert (await clients[0].record())["number"] == 7
+        for client in clients:
+            assert (await client.record())["number"] == 8
+            await client.close()
+
+
 async def test_slow_reader_gets_the_number_of_lost_lines(path: Path) -> None:
     """One event in the place of the lost lines, then the newest lines."""
     async with StreamServer(path, HELLO, queue_lines=10, unix_now_ns=lambda: 77) as server:

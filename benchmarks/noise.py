@@ -20,18 +20,16 @@ from instrument_time import Case, errors
 from measuring import normalised_squared
 
 from tsgt.analysis.diagnosis.noise_factors import near_gaps
-from tsgt.analysis.evaluation import NormalisedErrorStatistics, held_out_errors
+from tsgt.analysis.evaluation import held_out_errors
 from tsgt.config import ScenarioConfig, level_frame
 from tsgt.estimation import build_observations, instrument_time_sigma_s
 from tsgt.geometry import cartesian_to_polar, invert, log_so3, polar_to_cartesian, transform_points
 from tsgt.geometry.batch import TrajectoryFit, fit_trajectory, tune
-from tsgt.geometry.rest import find_rest, in_rest
 from tsgt.geometry.trajectory import Observations
 from tsgt.recording import load_recording
 from tsgt.simulation.world import World, scenario_world
 
 SCENARIO = ScenarioConfig()
-AXES = ("range", "horizontal_angle", "zenith_angle")
 STEP_S = 0.1
 MARGIN_S = 2.0
 LIMITS = (22.46, 38.26)
@@ -135,11 +133,10 @@ def held_out(path: Path) -> None:
         f"{path}: held-out mean {continuous.mean:.2f} of {linear.mean:.2f} mm ({continuous.mean / linear.mean:.2f}), 95 % "
         f"{continuous.p95:.1f} of {linear.p95:.1f} mm ({continuous.p95 / linear.p95:.2f})"
     )
-    normalised, rows = found["continuous"].normalised, found["continuous"].rows
-    if normalised is None or rows is None:
+    normalised = found["continuous"].normalised
+    if normalised is None:
         return
-    time_s = observations.time_s
-    at_rest = in_rest(find_rest(observations), time_s)[rows] >= 0
+    rows, at_rest = normalised.rows, normalised.stationary
     near = near_gaps(observations)[0][rows]
     inside = ~found["continuous"].at_gap
     print("| part | component | rms | without tails | beyond 3.29 sigmas, of 1000 | n |")
@@ -153,10 +150,10 @@ def held_out(path: Path) -> None:
     for station in np.unique(observations.station[rows]):
         parts[f"moving, station {station + 1}"] = moving & (observations.station[rows] == station)
     for name, part in parts.items():
-        for axis, of in enumerate(AXES):
-            each = NormalisedErrorStatistics.of(normalised[part, axis])
+        for of, each in normalised.statistics(part).items():
             print(
-                f"| {name} | {of.replace('_', ' ')} | {each.rms:.2f} | {each.robust:.2f} | {1e3 * each.beyond:.1f} | {each.n} |",
+                f"| {name} | {of.replace('_', ' ')} | {each.rms:.2f} | {each.robust:.2f} | "
+                f"{1e3 * each.beyond_3_29_sigma:.1f} | {each.n} |",
                 flush=True,
             )
 

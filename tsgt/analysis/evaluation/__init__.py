@@ -28,6 +28,7 @@ from tsgt.analysis.evaluation.held_out import (
     cross_validate,
     folds,
     held_out_errors,
+    held_out_keys,
     interpolation_errors,
     training_rows,
     trajectory_errors,
@@ -50,6 +51,7 @@ from tsgt.analysis.evaluation.metrics import (
     pose_errors,
 )
 from tsgt.analysis.evaluation.normalised_prediction import (
+    NormalisedErrors,
     NormalisedErrorStatistics,
     normalised_prediction_errors,
 )
@@ -87,6 +89,7 @@ __all__ = [
     "LivePoseStatistics",
     "LivePoses",
     "NormalisedErrorStatistics",
+    "NormalisedErrors",
     "Outlier",
     "PairDistances",
     "PoseComponents",
@@ -111,6 +114,7 @@ __all__ = [
     "error_details",
     "folds",
     "held_out_errors",
+    "held_out_keys",
     "inter_prism",
     "interior_mask",
     "interpolation_errors",

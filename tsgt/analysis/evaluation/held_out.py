@@ -8,25 +8,27 @@ folds; each fold of one prism is held out once. docs/reference/evaluate.md defin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from tsgt.analysis.evaluation.normalised_prediction import normalised_prediction_errors
+from tsgt.analysis.evaluation.normalised_prediction import NormalisedErrors, normalised_prediction_errors
 from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.smoothing import MIN_PRISMS, estimate_motion_model, recorded_motion_model
 from tsgt.estimation import centroid_m, noise_scales
 from tsgt.geometry.batch import fit_trajectory, scale_noise
 from tsgt.geometry.inertial import fit_inertial_trajectory
 from tsgt.geometry.motion_calibration import Setup
+from tsgt.geometry.rest import find_rest, in_rest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from tsgt.analysis.evaluation.normalised_prediction import NormalisedErrorStatistics
     from tsgt.analysis.refinement import Refine
     from tsgt.analysis.smoothing import MotionModel
     from tsgt.geometry import FloatArray
@@ -93,14 +95,12 @@ class PredictionErrorStatistics:
 class HeldOutErrors:
     """Distance between measured and predicted position of N held-out measurements, by fold; ``at_gap`` as in :class:`Fold`.
 
-    ``normalised``: (N, 3) by measured component, see :func:`normalised_prediction_errors`, and ``rows`` their rows of the
-    observations; None without covariance.
+    ``normalised``: the same errors by their covariance; None where there is none.
     """
 
     error_m: FloatArray
     at_gap: NDArray[np.bool_]
-    normalised: FloatArray | None = None
-    rows: NDArray[np.intp] | None = None
+    normalised: NormalisedErrors | None = None
 
     @property
     def statistics(self) -> PredictionErrorStatistics:
@@ -111,6 +111,19 @@ class HeldOutErrors:
     def gaps(self) -> PredictionErrorStatistics:
         """Of the measurements at gaps."""
         return PredictionErrorStatistics.of(self.error_m[self.at_gap])
+
+    def normalised_statistics(self) -> dict[str, dict[str, NormalisedErrorStatistics]]:
+        """By component, of all measurements that are not at gaps, of the moving and the stationary ones, and of those at gaps."""
+        if self.normalised is None:
+            return {}
+        stationary = self.normalised.stationary
+        parts = {
+            "all": ~self.at_gap,
+            "moving": ~self.at_gap & ~stationary,
+            "stationary": ~self.at_gap & stationary,
+            "gaps": self.at_gap,
+        }
+        return {name: self.normalised.statistics(part) for name, part in parts.items()}
 
 
 def folds(observations: Observations) -> list[Fold]:
@@ -241,13 +254,33 @@ def held_out_errors(
     result: dict[Predictor, HeldOutErrors] = {
         "linear": cross_validate(splits, lambda fold: interpolation_errors(observations, fold))
     }
+    rows = np.concatenate([fold.test for fold in splits]) if splits else np.empty(0, np.intp)
+    stationary = in_rest(find_rest(observations), observations.time_s[rows]) >= 0
     for name in predictors:
         result[name] = cross_validate(splits, partial(smoothing_errors, name))
         if splits:
-            rows = np.concatenate([fold.test for fold in splits])
-            result[name] = replace(result[name], normalised=np.concatenate(normalised[name]), rows=rows)
+            sigmas = np.concatenate(normalised[name])
+            in_sigmas = NormalisedErrors(sigmas, rows, observations.polar[rows], stationary)
+            result[name] = replace(result[name], normalised=in_sigmas)
     report(1.0)
     return result
+
+
+def held_out_keys(predicted: Mapping[Predictor, HeldOutErrors]) -> dict[str, Any]:
+    """Return the figures for ``--json``."""
+    return {
+        "held_out_mm": {
+            name: {**asdict(each.statistics), "gaps": asdict(each.gaps)} for name, each in predicted.items()
+        },
+        "normalised": {
+            name: {
+                part: {component: asdict(figures) for component, figures in of_part.items()}
+                for part, of_part in each.normalised_statistics().items()
+            }
+            for name, each in predicted.items()
+            if each.normalised is not None
+        },
+    }
 
 
 def _training_model(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.evaluation import noise_scales_by_axis
+from tsgt.analysis.evaluation import held_out_keys, noise_scales_by_axis
 from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.refinement import refinement_keys
@@ -67,10 +67,7 @@ def report_numbers(findings: Findings) -> dict[str, Any]:
     if f.live is not None:
         found["live"] = f.live.keys()
     if f.held_out is not None:
-        found["held_out_mm"] = {
-            name: {**dataclasses.asdict(each.statistics), "gaps": dataclasses.asdict(each.gaps)}
-            for name, each in f.held_out.items()
-        }
+        found |= held_out_keys(f.held_out)
     if f.difference is not None and len(f.difference.stamp_ns):
         found["estimators_apart"] = difference_numbers(f.difference)
     if f.continuous is not None:

@@ -13,6 +13,7 @@ from tsgt.analysis.evaluation import (
     PREDICTOR_NAMES,
     compare_live,
     held_out_errors,
+    held_out_keys,
     inter_prism,
     outliers,
     residual_statistics,
@@ -206,7 +207,7 @@ def evaluate(
                 "still_s": found.stationary_s,
                 "inter_prism_static_mm": _figures(found.static),
                 **({} if diagnosis is None else {"diagnosis": diagnosis.numbers()}),
-                **({} if predicted is None else {"held_out_mm": _held_out_keys(predicted)}),
+                **({} if predicted is None else held_out_keys(predicted)),
                 **refinement_keys(continuous.refinement, continuous.parameters),
                 **motion_keys(continuous),
                 **imu_keys(continuous.imu, continuous.imu_problem),
@@ -238,6 +239,10 @@ def evaluate(
     if predicted is not None:
         click.echo("\nHeld-out prediction error (mm)")
         _print_held_out(predicted)
+        click.echo(
+            "\nThe same errors in the sigmas that covariance and noise state (1 and 0.1 % if they are right)"
+        )
+        _print_normalised(predicted)
     click.echo(f"\n{refinement_text(continuous.refinement, continuous.parameters)}")
     used = imu_text(continuous)
     if used is not None:
@@ -291,13 +296,6 @@ def _held_out(
         raise RecordingError(str(error), path=path) from error
 
 
-def _held_out_keys(predicted: dict[Predictor, HeldOutErrors]) -> dict[str, Any]:
-    return {
-        name: {**dataclasses.asdict(each.statistics), "gaps": dataclasses.asdict(each.gaps)}
-        for name, each in predicted.items()
-    }
-
-
 def _figures(pairs: Sequence[PairDistances]) -> dict[str, Any]:
     return {pair.name: dataclasses.asdict(pair.statistics()) for pair in pairs}
 
@@ -321,6 +319,22 @@ def _print_held_out(predicted: dict[Predictor, HeldOutErrors]) -> None:
         )
     ]
     print_table(["estimator", "n", "mean", "median", "p95"], rows)
+
+
+def _print_normalised(predicted: dict[Predictor, HeldOutErrors]) -> None:
+    rows = [
+        [
+            f"{PREDICTOR_NAMES[name]}, {part}, {component.replace('_', ' ')}",
+            str(f.n),
+            *numbers(f.rms, f.robust),
+            f"{f.beyond_3_29_sigma:.1%}",
+        ]
+        for name, each in predicted.items()
+        for part, components in each.normalised_statistics().items()
+        if part in ("moving", "stationary")
+        for component, f in components.items()
+    ]
+    print_table(["estimator, part, component", "n", "rms", "rms by median", "beyond 3.29"], rows)
 
 
 def _print_outliers(rejected: Sequence[Outlier]) -> None:

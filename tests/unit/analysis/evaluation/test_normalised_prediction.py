@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from harness.prior_motion import draw_motions, measure, sorted_by_time
 
-from tsgt.analysis.evaluation import NormalisedErrorStatistics, normalised_prediction_errors
+from tsgt.analysis.evaluation import (
+    HeldOutErrors,
+    NormalisedErrors,
+    NormalisedErrorStatistics,
+    normalised_prediction_errors,
+)
 from tsgt.geometry.batch import fit_trajectory, scale_noise
 from tsgt.model import MotionPrior
 
@@ -33,9 +38,27 @@ def test_statistics_of_normal_errors_and_of_one_outlier() -> None:
     errors = np.random.default_rng(1).normal(size=2000)
     good = NormalisedErrorStatistics.of(errors)
     assert [good.rms, good.robust] == pytest.approx([1.0, 1.0], abs=0.05)
-    assert good.beyond < 0.004
+    assert good.beyond_3_29_sigma < 0.004
     errors[::100] = 20.0
     bad = NormalisedErrorStatistics.of(errors)
     assert bad.rms > 2.0
     assert bad.robust == pytest.approx(good.robust, abs=0.05)
-    assert bad.beyond == pytest.approx(0.01, abs=0.004)
+    assert bad.beyond_3_29_sigma == pytest.approx(0.01, abs=0.004)
+
+
+def test_parts_and_components_are_apart() -> None:
+    """Moving, stationary and at gaps; points have other components than polar measurements."""
+    sigmas = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0], [4.0, 4.0, 4.0]])
+    polar = np.array([True, True, True, False])
+    stationary, at_gap = np.array([False, True, False, True]), np.array([False, False, True, False])
+    errors = HeldOutErrors(np.zeros(4), at_gap, NormalisedErrors(sigmas, np.arange(4), polar, stationary))
+    found = {
+        part: {name: each.rms for name, each in components.items()}
+        for part, components in errors.normalised_statistics().items()
+    }
+    points = {"x": 4.0, "y": 4.0, "z": 4.0}
+    polar_axes = ("range", "horizontal_angle", "zenith_angle")
+    assert found["moving"] == dict(zip(polar_axes, (1.0, 2.0, 3.0), strict=True))
+    assert found["stationary"] == dict(zip(polar_axes, (4.0, 5.0, 6.0), strict=True)) | points
+    assert found["gaps"] == dict(zip(polar_axes, (7.0, 8.0, 9.0), strict=True))
+    assert set(found["all"]) == {*polar_axes, *points}

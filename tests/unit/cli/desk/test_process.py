@@ -199,6 +199,13 @@ def test_evaluate_text_agrees_with_json(tsgt: Tsgt, recording: Path) -> None:
             str(values["n"]),
             *(f"{values[key]:.2f}" for key in ("mean", "median", "p95")),
         ]
+    (normalised,) = result["normalised"].values()
+    horizontal = normalised["moving"]["horizontal_angle"]
+    assert row_of("continuous,", "moving,", "horizontal", "angle") == [
+        str(horizontal["n"]),
+        *(f"{horizontal[key]:.2f}" for key in ("rms", "robust")),
+        f"{horizontal['beyond_3_29_sigma']:.1%}",
+    ]
     residuals = result["residuals"]["2"]["zenith_angle"]
     assert row_of("2", "zenith", "angle")[:3] == [
         str(residuals["n"]),
@@ -216,6 +223,8 @@ def test_evaluate_text_agrees_with_json(tsgt: Tsgt, recording: Path) -> None:
         *result["inter_prism_mm"]["1-2"],
         *result["inter_prism_static_mm"]["1-2"],
         *result["held_out_mm"]["linear"],
+        *normalised,
+        *horizontal,
         *result["motion"],
         *residuals,
         *result["residuals"]["2"],

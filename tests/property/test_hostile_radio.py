@@ -191,6 +191,7 @@ def delivered(run: MissionResult, since_s: float) -> int:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["classic", "superframe", "superframe without a key"])
 @examples(1)
 @given(script=st.lists(st.tuples(damages, pauses_ms), min_size=20, max_size=80))

@@ -35,6 +35,7 @@ def test_truncation_loses_one_line_at_most(tmp_path: Path, *, beginning: bool) -
         assert len(numbers) - LINES_BEFORE[end] + len(problems) == bool(rest)
 
 
+@pytest.mark.slow
 def test_truncated_recording_can_be_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Even within the header."""
     monkeypatch.setattr(os, "fsync", lambda _: None)  # thousands of them, and nobody cuts the power

@@ -8,12 +8,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 LOADED = re.compile(
     r'<(?:script|img|iframe)[^>]*\ssrc="(https?:[^"]*)"|<link[^>]*rel="stylesheet"[^>]*href="(https?:[^"]*)"'
 )
 
 
+@pytest.mark.slow
 def test_site_builds_strictly_and_needs_no_network(tmp_path: Path) -> None:
     """No broken link, no page outside the navigation, no script, style or picture from elsewhere."""
     done = subprocess.run(

@@ -264,6 +264,7 @@ def test_missing_pymap3d_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mon
         receivers([file])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 200])
 def test_figure_of_few_and_of_many_epochs(tmp_path: Path, count: int) -> None:
     """With prisms and without; also with a receiver that was off all the time."""

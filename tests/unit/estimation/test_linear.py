@@ -230,6 +230,7 @@ def test_covariance_grows_between_measurements(scene: Scene) -> None:
     assert sigma_m[7] == pytest.approx(np.hypot(sigma_m[-1] / np.sqrt(2), unseen_m), rel=0.01)
 
 
+@pytest.mark.slow
 def test_covariance_is_consistent_for_an_accelerating_robot(scene: Scene) -> None:
     """Squared normalised errors of poses average to the number of their degrees of freedom.
 

@@ -72,6 +72,7 @@ def test_mirrored_target_still_gives_a_proper_rotation() -> None:
     assert found.rms_m > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [None, (1.0, 4.0, 0.3, 2.0, 9.0)])
 def test_covariance_matches_monte_carlo(weights: tuple[float, ...] | None) -> None:
     """Errors of 4000 fits with anisotropic noise have the propagated covariance, order and axes included."""

@@ -125,6 +125,7 @@ async def test_error_status_invalidates_the_pose(tmp_path: Path, *, authors: boo
     )
 
 
+@pytest.mark.slow
 async def test_restarted_station_with_another_clock_recovers(tmp_path: Path) -> None:
     """The other stations are not affected; the station recovers within seconds and its new clock is detected."""
     async with field_of(tmp_path, DRIVING) as field, running(field.master()):
@@ -392,6 +393,7 @@ def test_geofence_name_is_not_executed(tmp_path: Path) -> None:
     assert {each.name for each in tmp_path.iterdir()} == {"said", "$TSGT_FENCE"}
 
 
+@pytest.mark.slow
 async def test_stalled_link_stops_watchdog_notifications(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -264,6 +264,7 @@ async def test_slow_disk_delays_no_reply(tmp_path: Path, monkeypatch: pytest.Mon
         released.set()
 
 
+@pytest.mark.slow
 async def test_killed_client_has_journalled_all_readings(tmp_path: Path) -> None:
     """Cancelled after any number of steps of the event loop, and restarted."""
     async with field_day(tmp_path) as day:

@@ -220,6 +220,7 @@ def numbers_in(value: Any) -> Iterator[float]:
         yield float(value)
 
 
+@pytest.mark.slow
 def test_report_of_one_station(tsgt: Tsgt, tmp_path: Path) -> None:
     """There are no poses and no distances; the data of the station is shown."""
     recording = recorded(tmp_path, keep="1")
@@ -231,6 +232,7 @@ def test_report_of_one_station(tsgt: Tsgt, tmp_path: Path) -> None:
     assert {path.stem for path in (tmp_path / "report").glob("*.png")} == {*("calibration", "gaps")}
 
 
+@pytest.mark.slow
 def test_report_without_stationary_interval(tmp_path: Path) -> None:
     """The figure of stationary distances says so."""
     found = findings(recorded(tmp_path, driving))

@@ -50,6 +50,7 @@ def test_link_margin_is_power_minus_loss_minus_sensitivity(tsgt: Tsgt) -> None:
     assert plan["link_margin_db"] == pytest.approx(14 - 91.58 + 126.02, abs=0.05)
 
 
+@pytest.mark.slow
 def test_weak_link_is_a_warning(tsgt: Tsgt) -> None:
     """The field needs ten decibels."""
     plan = tsgt(*SUPERFRAME, 3, "--distance-m", 5000, "--json").json()
@@ -80,6 +81,7 @@ def test_region_selects_channel_and_limits(
     assert "Would comply: " in warning
 
 
+@pytest.mark.slow
 def test_compliant_settings_have_no_warning(tsgt: Tsgt) -> None:
     """500 kHz in the USA, and 7 dBm above 869.7 MHz in Europe."""
     for arguments in (
@@ -89,6 +91,7 @@ def test_compliant_settings_have_no_warning(tsgt: Tsgt) -> None:
         assert tsgt(*SUPERFRAME, 3, *arguments, "--json").json()["warnings"] == []
 
 
+@pytest.mark.slow
 def test_20_dbm_is_a_warning(tsgt: Tsgt) -> None:
     """The chip supports 20 dBm at a duty cycle of 1 % only."""
     (warning,) = tsgt(*SUPERFRAME, 3, "--power-dbm", 20, "--json").json()["warnings"]

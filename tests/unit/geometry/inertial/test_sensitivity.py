@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from harness.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.geometry.inertial import fit_inertial_trajectory
@@ -37,6 +38,7 @@ def fit(observations: Observations, *columns: int) -> InertialFit:
     )
 
 
+@pytest.mark.slow
 def test_common_covariance_is_that_of_a_displaced_set_up() -> None:
     """A station and a prism that are elsewhere move the poses as stated."""
     parameters = SetupParameters.of(Setup.of(OBSERVATIONS), np.zeros(3), range(3))

@@ -180,6 +180,7 @@ def test_local_coordinates_invert_a_step() -> None:
     assert found == pytest.approx(step, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_straight_drive_is_unobservable() -> None:
     """Driving straight on level ground leaves rotations about the path unobservable; a winding path leaves none."""
     straight = calibrate_motion(drive(30.0, straight=True), REFINE, prior=MOTION_PRIOR, noise_scale=1.0)

@@ -134,6 +134,7 @@ def test_leave_one_out_equals_calibration_without_the_point() -> None:
     assert solved.leave_one_out_m[2] == pytest.approx(np.linalg.norm(miss))
 
 
+@pytest.mark.slow
 def test_good_points_are_not_rejected() -> None:
     """In a hundred clean campaigns no point is rejected and none is inconsistent."""
     simulated = field()

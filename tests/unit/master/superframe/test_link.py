@@ -106,6 +106,7 @@ async def test_every_measurement_is_delivered(tmp_path: Path) -> None:
     assert events(field) == []
 
 
+@pytest.mark.slow
 async def test_beacons_are_recorded(tmp_path: Path) -> None:
     """With number and TxDone; frames last as long as their packets."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
@@ -164,6 +165,7 @@ async def test_missing_key_is_reported(tmp_path: Path) -> None:
 # --- Disk -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 async def test_unwritten_measurements_are_not_acknowledged(tmp_path: Path) -> None:
     """With a full disk poses continue and stations keep everything; later all is written once."""
     write_line = RecordingWriter.write_line
@@ -332,6 +334,7 @@ async def test_late_status_is_not_the_present_one(tmp_path: Path) -> None:
     assert "instrument_status 1" not in events(field)
 
 
+@pytest.mark.slow
 async def test_station_in_direct_mode_is_commanded_to_track(tmp_path: Path) -> None:
     """A refusal and its end are events."""
     async with field_of(tmp_path, superframe=True) as field:
@@ -350,6 +353,7 @@ async def test_station_in_direct_mode_is_commanded_to_track(tmp_path: Path) -> N
     assert not tool.direct_mode
 
 
+@pytest.mark.slow
 async def test_lost_prism_gets_search_commands(tmp_path: Path) -> None:
     """Every 5 s, in its own circles, until it is reacquired; the others are not affected."""
     scene = stationary_scene().moving(driving)

@@ -124,6 +124,7 @@ def test_daemon_killed_during_shutdown_counts_as_stopped(tmp_path: Path) -> None
     run_mission(tmp_path, duration_s=1.0, script=end_programs)
 
 
+@pytest.mark.slow
 def test_crash_window_ends_at_the_kill(tmp_path: Path) -> None:
     """Later activity of the killed client's tasks does not extend the window."""
     killed_s = []

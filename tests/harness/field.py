@@ -29,6 +29,7 @@ from tsgt.radio import DirectCommand, SearchCommand, TrackCommand
 from tsgt.radio.classic import ClassicStation, MeasurementMessage, raw_status
 from tsgt.radio.superframe import InstrumentState, QueuedMeasurement, SendQueue, SuperframeStation
 from tsgt.radio.superframe.wire import RESTART_SKIP, Authenticator, angle_code
+from tsgt.recording import DiskStatus
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
 from tsgt.simulation.lora import Air, LinkModel, radio_opener
 from tsgt.simulation.mission.authors_node import AUTHORS_TIMESTAMP_DELAY_MS, AuthorsNode
@@ -52,6 +53,7 @@ T = TypeVar("T")
 
 STATIONS = (1, 2, 3)
 PERIOD_NS = 400_000_000
+DISK = DiskStatus(free_bytes=20_000_000_000, total_bytes=32_000_000_000)
 KEY = bytes(range(32))
 TRUE = VirtualClock(START)
 """True time and the master's clock; zero of the loop is the start of the scene."""
@@ -335,6 +337,7 @@ class Field:
     air: Air
     scene: Scene
     stations: dict[int, Station]
+    disk: DiskStatus | None = DISK
     records: list[Any] = field(default_factory=list)
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(11))
 
@@ -391,6 +394,7 @@ class Field:
                 key=key,
                 random_bits=lambda bits: int(self.rng.integers(1 << bits)),
                 start_imu=start_imu,
+                disk_status=lambda _folder: self.disk,
                 observe=lambda record, _line: self.records.append(record),
             ),
         )

@@ -17,7 +17,16 @@ from tsgt.cli.output import CHECK_FAILED, printable
 from tsgt.cli.render import clock_time
 from tsgt.errors import StreamError
 from tsgt.model import Status
-from tsgt.recording import HelloRecord, ImuStatus, StationStatus, StatusRecord, Typed, decode
+from tsgt.recording import (
+    DiskStatus,
+    HelloRecord,
+    ImuStatus,
+    RecordingStatus,
+    StationStatus,
+    StatusRecord,
+    Typed,
+    decode,
+)
 from tsgt.station import ClientStatus
 
 if TYPE_CHECKING:
@@ -30,6 +39,9 @@ MAX_AGE_S = 3.0
 """A station whose last packet or measurement is older needs the operator."""
 
 MAX_IMU_AGE_S = 1.0
+
+MAX_WRITE_AGE_S = 5.0
+"""Lines that wait for longer are not written because the disk is full or fails."""
 
 MAX_MASTER_AGE_S = 10.0
 """While the master synchronises another station, a client receives nothing for a second or two."""
@@ -67,7 +79,7 @@ def status(socket_path: Path | None, *, as_json: bool) -> int:
     A master reports all its stations, a client its own station.
 
     Exit code 1: no daemon runs. 3: a daemon runs, but action is required: a station is not received or does not track,
-    the IMU gives no samples or disagrees with the prisms, or no pose is valid.
+    the IMU gives no samples or disagrees with the prisms, the disk fails, or no pose is valid.
     """
     record, line = _request(socket_path)
     text, ok = client_text(record) if isinstance(record, ClientStatus) else master_text(record)
@@ -94,7 +106,39 @@ def master_text(record: StatusRecord) -> tuple[list[str], bool]:
         label, imu_ok = imu_label(record.imu)
         lines += ["", _headline(f"IMU  {label}", ok=imu_ok), *_imu_lines(record.imu)]
         ok = ok and imu_ok
+    if record.recording is not None:
+        recording_lines, recording_ok = _recording_lines(record.recording, record.disk, record.stamp_ns)
+        lines += ["", *recording_lines]
+        ok = ok and recording_ok
     return lines, ok
+
+
+def _recording_lines(
+    recording: RecordingStatus, disk: DiskStatus | None, now_ns: int
+) -> tuple[list[str], bool]:
+    ok = recording_ok(recording, now_ns)
+    lines = [_headline(f"RECORDING  {'OK' if ok else 'DISK FAILS'}", ok=ok)]
+    lines += _wrapped(recording.file, "  ")
+    space = "" if disk is None else f", disk {size_text(disk.free_bytes)} free"
+    lines.append(f"  {size_text(recording.bytes)}{space}")
+    if not ok:
+        lines.append(f"  {recording.waiting_lines} lines not written yet")
+    if recording.lost_lines:
+        lines.append(f"  {recording.lost_lines} lines lost")
+    return lines, ok
+
+
+def recording_ok(recording: RecordingStatus, now_ns: int) -> bool:
+    """Return whether all lines are written, or the last ones were just now."""
+    written_ns = recording.last_write_ns
+    return recording.waiting_lines == 0 or (
+        written_ns is not None and now_ns - written_ns < MAX_WRITE_AGE_S * 1e9
+    )
+
+
+def size_text(size: int) -> str:
+    """Return a size in MB or GB."""
+    return f"{size / 1e6:.1f} MB" if size < 1_000_000_000 else f"{size / 1e9:.1f} GB"
 
 
 def imu_label(imu: ImuStatus) -> tuple[str, bool]:
@@ -169,6 +213,8 @@ def _station_lines(station: StationStatus) -> list[str]:
         "rejected beacons": station.rejected_beacons,
     }
     lines += [f"  {count} {name}" for name, count in counts.items() if count]
+    if station.last_target_check_age_s is not None:
+        lines.append(f"  targets checked {duration(station.last_target_check_age_s)} ago")
     return [line for line in lines if line.strip()]
 
 

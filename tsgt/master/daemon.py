@@ -10,7 +10,7 @@ import asyncio
 import secrets
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import structlog
@@ -19,17 +19,15 @@ import tsgt
 from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.config import ClassicMasterConfig
-from tsgt.errors import DegenerateGeometryError, RadioError, StreamError
-from tsgt.estimation import LiveEstimator
+from tsgt.errors import RadioError, StreamError
 from tsgt.imu import Imu
 from tsgt.master.classic import ClassicLink
-from tsgt.master.geofence import Geofence, run_geofence_command
 from tsgt.master.imu_monitor import ImuUseMonitor
-from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.master.link_events import MasterEvent
-from tsgt.master.publisher import Observer, Publisher
+from tsgt.master.observers import GeofenceObserver, layout_monitor
+from tsgt.master.publisher import Publisher
 from tsgt.master.reacquisition_hints import ReacquisitionHints
-from tsgt.master.recording_thread import RecordingThread
+from tsgt.master.recording_thread import RecordingDisk, RecordingThread, disk_status
 from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
@@ -39,7 +37,6 @@ from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import (
     EventRecord,
     HelloRecord,
-    PoseRecord,
     RecordingHeader,
     RecordingWriter,
     SetupGeofence,
@@ -47,17 +44,20 @@ from tsgt.recording import (
     ValidityLimits,
     encode_line,
     new_recording_path,
+    read_target_checks,
 )
 from tsgt.recording.recorder import Recorder
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Sequence
+    from collections.abc import AsyncGenerator, Callable
+    from pathlib import Path
 
     from tsgt.clock import Clock
-    from tsgt.config import GeofenceConfig, MasterConfig
+    from tsgt.config import MasterConfig
     from tsgt.master.link_events import LinkStatus
-    from tsgt.model import Measurement, Parameters
+    from tsgt.model import Parameters
     from tsgt.radio import LoRaSettings, Radio, RadioOpener
+    from tsgt.recording import DiskStatus
     from tsgt.service import StartProgram
 
 STATUS_PERIOD_NS = 1_000_000_000
@@ -83,6 +83,8 @@ class MasterDependencies:
     start_imu: StartProgram | None = None
     """Starts the program that reads the IMU; None: as a child process."""
     write: Callable[[int, memoryview], int] | None = None  # see :class:`~tsgt.recording.RecordingWriter`
+    disk_status: Callable[[Path], DiskStatus | None] = disk_status
+    """Returns the space on the disk of a folder; called in a thread."""
 
 
 async def run_master(
@@ -108,7 +110,7 @@ async def run_master(
         RecordingWriter(path, write=dependencies.write) as writer,
     ):
         recorder = Recorder(writer)
-        recording = RecordingThread(recorder)
+        recording = RecordingThread(recorder, lambda: timeline.unix_ns(clock.monotonic_ns()))
         header = RecordingHeader(
             software=f"tsgt {tsgt.__version__}", created_ns=start_ns, source="tsgt-master"
         )
@@ -128,12 +130,12 @@ async def run_master(
                 stations = [station.station for station in config.stations]
                 publisher = Publisher(
                     parameters,
-                    Statistics(stations),
+                    Statistics(stations, read_target_checks(config.recording.directory)),
                     StationEventDetector(stations, start_ns),
                     [
-                        _layout_monitor(config, parameters),
+                        layout_monitor(config.frame_watch, parameters),
                         ImuUseMonitor(),
-                        *(_GeofenceObserver(geofence, group) for geofence in config.geofences),
+                        *(GeofenceObserver(geofence, group) for geofence in config.geofences),
                     ],
                     emit,
                     lambda: timeline.unix_ns(clock.monotonic_ns()),
@@ -142,13 +144,15 @@ async def run_master(
                 publisher.put(_setup_record(config, parameters, start_ns, path.name, dependencies.key))
                 link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)
                 imu = _imu(config, timeline, publisher, dependencies)
-                master = _Master(clock, timeline, publisher, link, imu)
+                disk = RecordingDisk(recording, path, start_ns, dependencies.disk_status)
+                master = _Master(clock, timeline, publisher, link, imu, disk)
                 log.info("master_started", recording=str(path), stations=len(config.stations))
                 service.sd_notify("READY=1")
                 group.create_task(recording.run())
                 group.create_task(
                     service.sync_periodically(writer.sync, clock, config.recording.fsync_interval_s)
                 )
+                group.create_task(disk.measure_space(clock))
                 group.create_task(master.publish_due_poses())
                 group.create_task(master.publish_status())
                 group.create_task(master.notify_watchdog())
@@ -245,13 +249,20 @@ class _Master:
     """The tasks of the master."""
 
     def __init__(
-        self, clock: Clock, timeline: UnixTimeline, publisher: Publisher, link: Link, imu: Imu | None
+        self,
+        clock: Clock,
+        timeline: UnixTimeline,
+        publisher: Publisher,
+        link: Link,
+        imu: Imu | None,
+        disk: RecordingDisk,
     ) -> None:
         self._clock = clock
         self._timeline = timeline
         self._publisher = publisher
         self._link = link
         self._imu = imu
+        self._disk = disk
         self._radio_failed = False
 
     def _now_ns(self) -> int:
@@ -274,9 +285,13 @@ class _Master:
         while True:
             next_ns = max(next_ns + STATUS_PERIOD_NS, self._clock.monotonic_ns())
             await self._clock.sleep_until(next_ns)
+            for event in self._disk.events(self._now_ns()):
+                self._publisher.report(event)
             status = self._publisher.publish_status(
                 self._link.status(),
                 None if self._imu is None else self._imu.status(),
+                self._disk.recording_status(),
+                self._disk.space,
                 realtime_ns=self._clock.realtime_ns(),
             )
             received = sum(s.last_heard_s is not None and s.last_heard_s < 5 for s in status.stations)
@@ -317,67 +332,3 @@ class _Master:
                 raise
 
         return opened
-
-
-def _layout_monitor(config: MasterConfig, parameters: Parameters) -> Observer:
-    monitor = LayoutMonitor(config.frame_watch, parameters.pipeline.period_ns)
-    if parameters.pipeline.estimator == "linear":
-        return monitor
-    try:
-        return _LinearPoses(monitor, parameters)
-    except DegenerateGeometryError:  # one or two prisms, or all in a line, and an IMU
-        return _FinalPoses(monitor)
-
-
-class _FinalPoses(Observer):
-    """Gives an observer the final poses only. Unlike without an IMU, their trajectory does not give way to wrong prisms."""
-
-    def __init__(self, observer: Observer) -> None:
-        self._observer = observer
-
-    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
-        final = record.kind == "smoothed" and record.delay_s is None
-        return self._observer.pose(record, now_ns) if final else []
-
-
-class _LinearPoses(Observer):
-    """Gives an observer the poses of the estimator ``linear`` instead of the published ones."""
-
-    def __init__(self, observer: Observer, parameters: Parameters) -> None:
-        self._observer = observer
-        pipeline = replace(parameters.pipeline, estimator="linear")
-        self._estimator = LiveEstimator(replace(parameters, pipeline=pipeline))
-
-    def measurement(self, record: Measurement) -> Sequence[EventRecord]:
-        poses = (found for found in self._estimator.measurement(record) if isinstance(found, PoseRecord))
-        return [event for pose in poses for event in self._observer.pose(pose, record.received_ns)]
-
-
-class _GeofenceObserver(Observer):
-    """A geofence and the command that runs when it is crossed."""
-
-    def __init__(self, config: GeofenceConfig, group: asyncio.TaskGroup) -> None:
-        self._geofence = Geofence(config)
-        self._config = config
-        self._group = group
-
-    def pose(self, record: PoseRecord, now_ns: int) -> Sequence[EventRecord]:
-        return self._run_command(self._geofence.pose(record, now_ns))
-
-    def tick(self, now_ns: int) -> Sequence[EventRecord]:
-        return self._run_command(self._geofence.tick(now_ns))
-
-    def next_deadline_ns(self) -> int | None:
-        return self._geofence.next_deadline_ns()
-
-    def _run_command(self, events: Sequence[EventRecord]) -> Sequence[EventRecord]:
-        if self._config.command:
-            for event in events:
-                command = run_geofence_command(
-                    self._config.command, event=event.event, fence=self._config.name
-                )
-                try:
-                    self._group.create_task(command)
-                except RuntimeError:  # the task group is shutting down
-                    command.close()
-        return events

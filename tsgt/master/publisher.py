@@ -22,7 +22,15 @@ if TYPE_CHECKING:
     from tsgt.master.station_events import StationEventDetector
     from tsgt.master.statistics import Statistics
     from tsgt.model import ImuSamples, Measurement, Parameters
-    from tsgt.recording import BeaconRecord, ClockRecord, ImuStatus, SetupRecord, StatusRecord
+    from tsgt.recording import (
+        BeaconRecord,
+        ClockRecord,
+        DiskStatus,
+        ImuStatus,
+        RecordingStatus,
+        SetupRecord,
+        StatusRecord,
+    )
 
 
 class Observer:
@@ -112,7 +120,13 @@ class Publisher:
                 self.put(EventRecord(stamp_ns=now_ns, event=name, message=message))
 
     def publish_status(
-        self, link: link_events.LinkStatus, imu: ImuStatus | None = None, *, realtime_ns: int
+        self,
+        link: link_events.LinkStatus,
+        imu: ImuStatus | None = None,
+        recording: RecordingStatus | None = None,
+        disk: DiskStatus | None = None,
+        *,
+        realtime_ns: int,
     ) -> StatusRecord:
         """Publish the events of expired time-outs and a status record; ``realtime_ns`` is the machine's Unix clock."""
         now_ns = self._now_ns()
@@ -126,7 +140,7 @@ class Publisher:
                 gyro_bias_radps=state.gyro_bias_radps,
                 accelerometer_bias_mps2=state.accelerometer_bias_mps2,
             )
-        status = self._statistics.status(now_ns, link, imu)
+        status = self._statistics.status(now_ns, link, imu, recording, disk)
         self.put(status)
         return status
 

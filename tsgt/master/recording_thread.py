@@ -3,18 +3,36 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
+from tsgt.master.disk_monitor import DiskMonitor
+from tsgt.recording import DiskStatus, RecordingStatus
+
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tsgt.clock import Clock
+    from tsgt.errors import RecordingError
+    from tsgt.master.link_events import MasterEvent
     from tsgt.recording.recorder import Recorder
 
 
-class RecordingThread:
-    """Takes lines without waiting, writes them in a thread and reports which were written. Does not close the recorder."""
+DISK_SPACE_PERIOD_NS = 5_000_000_000
 
-    def __init__(self, recorder: Recorder) -> None:
+
+class RecordingThread:
+    """Takes lines without waiting, writes them in a thread and reports which were written. Does not close the recorder.
+
+    ``unix_now_ns``: the master's Unix clock.
+    """
+
+    def __init__(self, recorder: Recorder, unix_now_ns: Callable[[], int]) -> None:
         self._recorder = recorder
+        self._unix_now_ns = unix_now_ns
+        self._last_write_ns: int | None = None
         self._pending = asyncio.Event()
         self._flushed = asyncio.Event()
 
@@ -22,6 +40,21 @@ class RecordingThread:
     def line_count(self) -> int:
         """Lines put so far; the number of the next one."""
         return self._recorder.line_count
+
+    @property
+    def error(self) -> RecordingError | None:
+        """Why the last write failed; None if it did not."""
+        return self._recorder.error
+
+    def status(self, file: str) -> RecordingStatus:
+        """Return the status of the recording with this file name."""
+        return RecordingStatus(
+            file=file,
+            bytes=self._recorder.size,
+            last_write_ns=self._last_write_ns,
+            waiting_lines=self._recorder.pending,
+            lost_lines=self._recorder.lost,
+        )
 
     def put(self, line: bytes) -> None:
         """Queue a line."""
@@ -45,5 +78,48 @@ class RecordingThread:
         while True:
             await self._pending.wait()
             self._pending.clear()
+            written_before = self._recorder.written_count
             await asyncio.to_thread(self._recorder.flush)
+            if self._recorder.written_count > written_before:
+                self._last_write_ns = self._unix_now_ns()
             self._flushed.set()
+
+
+class RecordingDisk:
+    """The recording and the space on its disk; ``space`` is None before the first measurement of it."""
+
+    def __init__(
+        self,
+        recording: RecordingThread,
+        path: Path,
+        start_ns: int,
+        disk_status: Callable[[Path], DiskStatus | None],
+    ) -> None:
+        self._recording = recording
+        self._path = path
+        self._monitor = DiskMonitor(start_ns)
+        self._disk_status = disk_status
+        self.space: DiskStatus | None = None
+
+    async def measure_space(self, clock: Clock) -> NoReturn:
+        """Measure the space periodically, in a thread: a disk may not respond."""
+        while True:
+            self.space = await asyncio.to_thread(self._disk_status, self._path.parent)
+            await clock.sleep_until(clock.monotonic_ns() + DISK_SPACE_PERIOD_NS)
+
+    def recording_status(self) -> RecordingStatus:
+        """Return the status of the recording."""
+        return self._recording.status(self._path.name)
+
+    def events(self, now_ns: int) -> list[MasterEvent]:
+        """Return the events of a disk that has filled up, failed or recovered."""
+        return self._monitor.update(now_ns, self.recording_status(), self._recording.error, self.space)
+
+
+def disk_status(directory: Path) -> DiskStatus | None:
+    """Return the space on the disk of a directory; None if it cannot be determined. May wait for the disk."""
+    try:
+        usage = shutil.disk_usage(directory)
+    except OSError:
+        return None
+    return DiskStatus(free_bytes=usage.free, total_bytes=usage.total)

@@ -43,6 +43,8 @@ PAGES: dict[Path, tuple[type, ...]] = {
         recording.StatusRecord,
         recording.StationStatus,
         recording.ImuStatus,
+        recording.RecordingStatus,
+        recording.DiskStatus,
         recording.EventRecord,
     ),
     Path("docs/reference/recording.md"): (

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from tsgt.master.link_events import LinkStatus, SuperframeState
     from tsgt.model import Measurement
-    from tsgt.recording import ImuStatus
+    from tsgt.recording import DiskStatus, ImuStatus, RecordingStatus
     from tsgt.timesync.two_way import ClockEstimate
 
 RATE_WINDOW_NS = 10_000_000_000
@@ -26,10 +26,14 @@ _LOCKED = (Status.OK, Status.LOW_ACCURACY, Status.ANGLE_ONLY)
 
 
 class Statistics:
-    """Counts packets, measurements and poses of the stations that it was made for, in their order."""
+    """Counts packets, measurements and poses of the stations that it was made for, in their order.
 
-    def __init__(self, stations: Iterable[int]) -> None:
-        self._stations = {station: _Station() for station in stations}
+    ``target_checks``: Unix time in ns at which a station was last found where it was calibrated, where known.
+    """
+
+    def __init__(self, stations: Iterable[int], target_checks: Mapping[int, int] | None = None) -> None:
+        checks = target_checks or {}
+        self._stations = {station: _Station(checked_ns=checks.get(station)) for station in stations}
         self._poses = 0
         self._valid_poses = 0
 
@@ -76,7 +80,14 @@ class Statistics:
         self._poses += 1
         self._valid_poses += valid
 
-    def status(self, now_ns: int, link: LinkStatus = NO_LINK, imu: ImuStatus | None = None) -> StatusRecord:
+    def status(
+        self,
+        now_ns: int,
+        link: LinkStatus = NO_LINK,
+        imu: ImuStatus | None = None,
+        recording: RecordingStatus | None = None,
+        disk: DiskStatus | None = None,
+    ) -> StatusRecord:
         """Return the status at an instant on the master's Unix clock."""
         stations = (
             station.status_at(number, now_ns, link.clock(number, now_ns))
@@ -91,6 +102,8 @@ class Statistics:
             authenticated=link.authenticated,
             frame_ms=link.frame_ms,
             imu=imu,
+            recording=recording,
+            disk=disk,
         )
 
 
@@ -113,6 +126,7 @@ class _Station:
     first_ns: int = 0
     superframe: SuperframeState | None = None
     outside_lag_window: int | None = None
+    checked_ns: int | None = None
 
     def status_at(self, number: int, now_ns: int, clock: ClockEstimate | None) -> StationStatus:
         while self.arrivals_ns and self.arrivals_ns[0] <= now_ns - RATE_WINDOW_NS:
@@ -140,6 +154,7 @@ class _Station:
             missed_slots=None if state is None else state.missed_slots,
             rejected_beacons=None if state is None else state.rejected_beacons,
             outside_lag_window=self.outside_lag_window,
+            last_target_check_age_s=_age_s(self.checked_ns, now_ns),
         )
 
     def _rate_hz(self, now_ns: int) -> float | None:

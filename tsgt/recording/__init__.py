@@ -31,16 +31,19 @@ from tsgt.recording.stream_records import (
     BeaconRecord,
     ClockRecord,
     Degradation,
+    DiskStatus,
     EventRecord,
     HelloRecord,
     ImuStatus,
     Kind,
     PoseRecord,
+    RecordingStatus,
     StationShare,
     StationStatus,
     StatusRecord,
     ValidityLimits,
 )
+from tsgt.recording.target_checks import read_target_checks, write_target_checks
 from tsgt.recording.writer import RecordingWriter
 
 __all__ = [
@@ -51,6 +54,7 @@ __all__ = [
     "BeaconRecord",
     "ClockRecord",
     "Degradation",
+    "DiskStatus",
     "EventRecord",
     "HelloRecord",
     "ImuStatus",
@@ -60,6 +64,7 @@ __all__ = [
     "PoseRecord",
     "Recording",
     "RecordingHeader",
+    "RecordingStatus",
     "RecordingWriter",
     "SetupGeofence",
     "SetupPrism",
@@ -77,6 +82,8 @@ __all__ = [
     "new_recording_path",
     "read_imu_samples",
     "read_lines",
+    "read_target_checks",
     "sync_folder",
     "write_atomically",
+    "write_target_checks",
 ]

@@ -27,7 +27,7 @@ class Recorder:
     A caller that must not wait for a slow disk calls :meth:`put`, and :meth:`flush` in a thread. :meth:`close` writes
     every pending line. Lines are numbered as they are put, so that the caller can ask which were written.
     ``max_pending_lines``: queue capacity; beyond it the oldest lines are lost, and counted in the log. ``lost``: lines
-    lost in all.
+    lost in all. ``error``: why the last write failed; None if it did not.
     """
 
     def __init__(self, writer: RecordingWriter, *, max_pending_lines: int = MAX_PENDING_LINES) -> None:
@@ -35,7 +35,7 @@ class Recorder:
         self._queue: deque[tuple[int, bytes]] = deque()
         self._max_pending_lines = max_pending_lines
         self._lock = threading.Lock()
-        self._failing = False
+        self.error: RecordingError | None = None
         self._lost_in_outage = 0
         self._line_count = 0
         self.lost = 0
@@ -61,7 +61,17 @@ class Recorder:
     @property
     def failing(self) -> bool:
         """Whether the last write failed."""
-        return self._failing
+        return self.error is not None
+
+    @property
+    def written_count(self) -> int:
+        """Lines that are in the file, and lost ones before them."""
+        return self._written
+
+    @property
+    def size(self) -> int:
+        """Length of the file in bytes."""
+        return self._writer.size
 
     def put(self, line: bytes) -> None:
         """Queue a line without writing it; never waits."""
@@ -96,15 +106,15 @@ class Recorder:
                 self._queue.popleft()
                 self._written = number + 1
         except RecordingError as error:
-            if not self._failing:
+            if self.error is None:
                 log.error("recording_failed", error=str(error))  # noqa: TRY400 (the message suffices)
-            self._failing = True
+            self.error = error
             while len(self._queue) > self._max_pending_lines:
                 self._lose(self._queue.popleft()[0])
         else:
-            if self._failing:
+            if self.error is not None:
                 log.info("recording_recovered", lost_lines=self._lost_in_outage)
-            self._failing, self._lost_in_outage = False, 0
+            self.error, self._lost_in_outage = None, 0
 
     def _lose(self, number: int) -> None:
         if not self._lost_in_outage:

@@ -259,6 +259,14 @@ class StationStatus(FiniteNumbers):
     outside_lag_window: int | None = None
     """Measurements that arrived after the poses of their time had been smoothed; only post-processing uses them. Null
     with the estimator linear."""
+    battery_percent: int | None = None
+    """Charge of the instrument's battery; null where unknown, as over the radio today."""
+    atmospheric_ppm: float | None = None
+    """Atmospheric correction that the instrument applies to distances, in 1e-6; null where unknown, as over the radio
+    today."""
+    last_target_check_age_s: float | None = None
+    """Time in s since ``tsgt calibrate check`` last found the station where it was calibrated; null if it never has, or
+    last found that it has moved."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -310,7 +318,35 @@ class ImuStatus(FiniteNumbers):
         return parts + [text for text in (self.problem, self.disagreement) if text]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingStatus(FiniteNumbers):
+    """The status of the recording."""
+
+    file: str
+    """Its file name, as in ``setup``."""
+    bytes: int
+    """Its length in bytes."""
+    last_write_ns: int | None
+    """When the last lines were written, on the master's Unix clock in ns; null before the first ones."""
+    waiting_lines: int
+    """Lines that are not in the file yet; they pile up while the disk fails."""
+    lost_lines: int
+    """Lines that are lost because too many were waiting."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiskStatus(FiniteNumbers):
+    """The space on the disk of the recording."""
+
+    free_bytes: int
+    """Free for the master."""
+    total_bytes: int
+    """Its size."""
+
+
 ImuStatusOrNone = ImuStatus | None
+RecordingStatusOrNone = RecordingStatus | None
+DiskStatusOrNone = DiskStatus | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -336,6 +372,10 @@ class StatusRecord(FiniteNumbers):
     """Mean duration of the last frames, from beacon to beacon, in ms; null with ``classic``."""
     imu: ImuStatusOrNone = None
     """Status of the robot's IMU; absent where none is configured."""
+    recording: RecordingStatusOrNone = None
+    """Status of the recording; null in recordings of older versions."""
+    disk: DiskStatusOrNone = None
+    """Space on its disk; null where unknown."""
 
     def __post_init__(self) -> None:
         """Reject times outside 64 bits."""

@@ -32,7 +32,7 @@ class RecordingWriter:
     A line is in the kernel when :meth:`write` returns, and on the disk after the next :meth:`sync`. The file is locked:
     it has one writer at a time. The caller writes the header and the parameters that begin every session. ``path``: a
     new file, or a recording to continue. ``write``: passes bytes to the kernel, default :func:`os.write`; simulations
-    use one that fails. ``cut_bytes``: length of the torn line that was cut off the end of the file; 0 when it was
+    use one that fails. ``size``: length of the file in bytes. ``cut_bytes``: length of the torn line that was cut off the end of the file; 0 when it was
     complete. Raises RecordingError if the file cannot be opened, is not a recording, or another program is writing it.
     Raises RecordingVersionError if it is a recording of another version.
     """
@@ -50,6 +50,7 @@ class RecordingWriter:
             self._lock()
             self._torn_at: int | None = None
             self.cut_bytes = self._repair()
+            self.size = os.fstat(self._fd).st_size
         except OSError as error:
             os.close(self._fd)
             raise RecordingError(f"cannot be continued ({error.strerror})", path=path) from error
@@ -121,6 +122,7 @@ class RecordingWriter:
             with suppress(OSError):  # may fail too; the next line tries again
                 self._cut_torn_line()
             raise
+        self.size = size + len(data)
         self._unsynced = True  # after the write, so that a concurrent sync does not count it as synced
 
     def _cut_torn_line(self) -> None:

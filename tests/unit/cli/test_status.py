@@ -14,7 +14,7 @@ from harness.records import IMU_STATUS
 
 from tsgt.cli.status import client_text, duration, master_text, station_label
 from tsgt.model import Status
-from tsgt.recording import HelloRecord, StationStatus, StatusRecord, encode_line
+from tsgt.recording import DiskStatus, HelloRecord, RecordingStatus, StationStatus, StatusRecord, encode_line
 from tsgt.recording.journal import InstrumentRecord
 from tsgt.station import ClientStatus
 from tsgt.station.status import LastMeasurement
@@ -100,6 +100,30 @@ def test_master_without_problems() -> None:
     assert well
     for part in ("valid 390", "STATION 2  TRACKING", "1.58 Hz", "loss 2 %", "-81 dBm", "clock bound 0.84 ms"):
         assert part in text
+
+
+def test_recording_and_disk_are_shown() -> None:
+    """Lines that have been waiting for seconds are a problem; those of the last second are not."""
+    recording = RecordingStatus(
+        file="master-20261121T055100Z.jsonl",
+        bytes=12_345_678,
+        last_write_ns=NOW_NS - 100_000_000,
+        waiting_lines=2,
+        lost_lines=0,
+    )
+    disk = DiskStatus(free_bytes=20_000_000_000, total_bytes=32_000_000_000)
+    lines, well = master_text(dataclasses.replace(MASTER, recording=recording, disk=disk))
+    assert well
+    assert lines[-3:] == [
+        click.style("RECORDING  OK", bold=True, reverse=False),
+        "  master-20261121T055100Z.jsonl",
+        "  12.3 MB, disk 20.0 GB free",
+    ]
+    full = dataclasses.replace(recording, last_write_ns=NOW_NS - 9_000_000_000, lost_lines=1)
+    lines, well = master_text(dataclasses.replace(MASTER, recording=full))
+    assert not well
+    assert lines[-5] == click.style("RECORDING  DISK FAILS", bold=True, reverse=True)
+    assert lines[-3:] == ["  12.3 MB", "  2 lines not written yet", "  1 lines lost"]
 
 
 def test_sound_imu_is_shown_with_its_biases() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from harness import imu
 from harness.bridge import FakeStart
-from harness.field import STATIONS, TRUE, field_of, running
+from harness.field import DISK, STATIONS, TRUE, field_of, running
 from harness.radios import PAPER
 from harness.scene import START, driving, stationary_scene
 
@@ -25,12 +25,15 @@ from tsgt.master.replay import replayed
 from tsgt.model import ImuSamples, PolarMeasurement, Status
 from tsgt.recording import (
     ClockRecord,
+    DiskStatus,
     EventRecord,
     PoseRecord,
+    SetupRecord,
     StatusRecord,
     encode_line,
     read_imu_samples,
     read_lines,
+    write_target_checks,
 )
 from tsgt.service import run
 from tsgt.simulation.lora import radio_opener
@@ -436,3 +439,51 @@ async def test_stalled_link_stops_watchdog_notifications(
                 await asyncio.sleep(30)
                 assert signs_of_life == before
         asyncio.get_running_loop().remove_reader(systemd)
+
+
+async def test_status_has_recording_disk_and_target_checks(tmp_path: Path) -> None:
+    """And a disk that is nearly full is an event."""
+    async with field_of(tmp_path, superframe=True) as field:
+        config = field.config()
+        config.recording.directory.mkdir()
+        write_target_checks(config.recording.directory, {2: True}, START - 60_000 * MS)
+        async with running(field.master(config)):
+            await asyncio.sleep(7.5)
+            status = field.of(StatusRecord)[-1]
+            assert events(field) == []
+            field.disk = DiskStatus(free_bytes=500_000_000, total_bytes=32_000_000_000)
+            await asyncio.sleep(7)
+            assert events(field) == ["disk_low"]
+            last = field.of(StatusRecord)[-1]
+        recording = config.recording.directory / (field.of(SetupRecord)[0].recording or "")
+    assert status.recording is not None
+    assert status.recording.last_write_ns is not None
+    assert status.stamp_ns - 1000 * MS < status.recording.last_write_ns <= status.stamp_ns
+    assert 1000 < status.recording.bytes < recording.stat().st_size
+    assert (status.recording.file, status.recording.waiting_lines) == (recording.name, 0)
+    assert status.disk == DISK
+    assert last.disk == field.disk
+    ages_s = [station.last_target_check_age_s for station in status.stations]
+    assert (ages_s[0], ages_s[2]) == (None, None)
+    assert ages_s[1] == pytest.approx(60 + (status.stamp_ns - START) / 1e9)
+
+
+async def test_setup_is_recorded_and_streamed(tmp_path: Path) -> None:
+    """The same line, after the parameters and after the greeting; a replay begins with it."""
+    fence = GeofenceConfig(name="site", polygon_m=((-9.0, -9.0), (9.0, -9.0), (0.0, 9.0)), margin_m=0.5)
+    async with field_of(tmp_path, superframe=True) as field:
+        config = field.config(geofences=(fence,))
+        async with running(field.master(config)):
+            await asyncio.sleep(2)
+            reader, writer = await asyncio.open_unix_connection(config.stream.socket)
+            greeting = [(await reader.readline()).removesuffix(b"\n") for _ in range(2)]
+            writer.close()
+    (setup,) = field.of(SetupRecord)
+    recorded = [line for line in read_lines(field.recording()) if line.type != "recording"]
+    assert [line.type for line in recorded[:2]] == ["parameters", "setup"]
+    assert greeting[1] == recorded[1].data == encode_line(setup)
+    assert next(replayed(field.recording()))[1] == [encode_line(setup)]
+    assert (setup.protocol, setup.authenticated) == ("superframe", True)
+    assert [(each.name, each.allowed_side, each.margin_m) for each in setup.geofences] == [
+        ("site", "inside", 0.5)
+    ]

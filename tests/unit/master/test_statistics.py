@@ -45,6 +45,12 @@ def test_counts_measurements_and_usable_ones() -> None:
     assert station.age_s == 1.0
 
 
+def test_age_of_the_last_target_check() -> None:
+    """Of a station that was checked; null for the others."""
+    first, second = Statistics([1, 2], {2: 10 * SECOND}).status(12 * SECOND).stations
+    assert (first.last_target_check_age_s, second.last_target_check_age_s) == (None, 2.0)
+
+
 def test_unknown_station_is_ignored() -> None:
     """Unknown station is ignored."""
     statistics = Statistics([1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING
 
 import click
@@ -22,7 +23,8 @@ from tsgt.cli.options import (
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.clock import SystemClock
 from tsgt.config import MasterConfig, load
-from tsgt.errors import InputFileError, TsgtError
+from tsgt.errors import InputFileError, OutputFileError, TsgtError
+from tsgt.recording import write_target_checks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -103,6 +105,14 @@ def check(
         then = mean_points(targets_file, before[station], constant, what)
         now = mean_points(targets_file, sights, constant, what)
         results[station] = check_station(then, now, limit_m=limit_mm / 1e3)
+    try:
+        write_target_checks(
+            config.recording.directory,
+            {station: each.ok for station, each in results.items()},
+            time.time_ns(),
+        )
+    except OutputFileError as error:
+        click.echo(f"warning: the master will not know of this check: {error}", err=True)
     return print_check(results, as_json=as_json)
 
 

@@ -7,6 +7,8 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tsgt.recording import DiskStatus
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -24,6 +26,12 @@ class SimulatedDisk:
     write_error: int | None = None  # error number of all writes, ENOSPC or EROFS; None: writes succeed
     _failure_ns: tuple[int, int] | None = None
 
+    def status(self) -> DiskStatus:
+        """Return its space."""
+        return DiskStatus(
+            free_bytes=0 if self.write_error == errno.ENOSPC else _FREE_BYTES, total_bytes=_TOTAL_BYTES
+        )
+
     def fail_writes(self, error: int, since_ns: int, until_ns: int) -> None:
         """Fail all writes with an error. The end time only informs :meth:`failing_since_ns`; reset ``write_error`` to end."""
         if self._failure_ns is not None and since_ns <= self._failure_ns[1] + WRITE_RECOVERY_NS:
@@ -36,6 +44,10 @@ class SimulatedDisk:
         if self._failure_ns is None or now_ns > self._failure_ns[1] + WRITE_RECOVERY_NS:
             return now_ns - UNWRITTEN_WINDOW_NS
         return self._failure_ns[0]
+
+
+_TOTAL_BYTES = 32_000_000_000
+_FREE_BYTES = 20_000_000_000
 
 
 class ProcessKilled(BaseException):

@@ -242,6 +242,7 @@ class Mission:
                     observe=master_log.observe,
                     start_imu=start_imu,
                     write=computer.new_writer(),
+                    disk_status=lambda _folder: computer.disk.status(),
                 ),
             ),
         )

@@ -113,7 +113,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._mounting = replace(mounting, position=np.zeros(3)) if gyro_only else mounting
         self._prior, self._gyro_only = prior, prior if gyro_only else None
         self._initial_gravity = self._gravity = Gravity.of(imu)
-        self._health = HealthMonitor()
+        self._health = HealthMonitor(imu)
         self._samples: InertialSamples | None = None
         self._stale_from_s = np.inf  # Samples after this have arrived since the integration
         self._window: _Window | None = None

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.rigid import FloatArray
+    from tsgt.model import ImuParameters
 
 MAX_AGE_S = 0.4
 """Of the newest sample. Lines of ten samples come every 0.05 s at 200 Hz, a busy computer delays them by 0.1 s; after 0.4 s the
@@ -24,16 +25,27 @@ STUCK_S = 0.1
 MAX_RATE_RADPS, MAX_FORCE_MPS2 = 40.0, 350.0
 """Beyond any measuring range (2000 deg/s and 32 g are 35 rad/s and 314 m/s^2): such values are no measurements."""
 
-SATURATED_SAMPLES, SATURATED_RATE_RADPS, SATURATED_FORCE_MPS2 = 4, 1.5, 19.0
-SATURATED_RATE_CHANGE = 2e-3
-"""An axis is at its limit if so many successive values, above these magnitudes, are the same: forces exactly, angular rates to
-this share, for the gyro matrix adds a little of the other axes. A robot that turns or is hit so fast never does it so evenly.
-"""
+LIMIT_SPAN_S = 0.5
+"""Samples among which values at the limit of an axis are looked for."""
+LIMIT_CHANCE = 1e-9
+"""Probability that as many values as show a limit are the same by chance: noise changes successive values by some of their steps."""
+MIN_CHANCE, STEP_SHARE = 1e-3, 0.5
+"""Probability that two values are the same: this share of their step over their noise, at least the first."""
+LIMIT_STEPS = 20  # Below a limit, in which fewer values must be than at it
+MIN_MOTION_STEPS = 40  # Spread of values that change, so that repeated ones are none of a robot at rest
+MIN_LIMITS = np.repeat(
+    [0.04, 5.0], 3
+)  # Of angular rate and specific force, below which a robot at rest repeats values
+
+BLOW_MPS2 = 50.0
+"""Specific force of a blow, on any axis: bumps and slopes give 15 m/s^2, a bracket that is knocked gives hundreds."""
 
 INCONSISTENT_NIS = 25.0
 """NIS (3 degrees of freedom) of a measurement that disagrees with the samples; 1.5 in 100 000 consistent ones exceed it."""
 DISAGREEMENT_S = 1.2  # Within which two prisms must disagree: each is measured two or three times in it
 ALONE = 3  # Successive measurements of one prism that disagree, where none other is measured: it cannot be told from the IMU
+
+_ROUNDING = 1e-9  # Of the product with the gyro matrix, relative
 
 HOLD_S = 2.0
 """For which the samples must have been sound again: a few measurements of each prism, which have agreed with them."""
@@ -46,17 +58,26 @@ class HealthMonitor:
     increments of rotation, velocity and position all enter it, with their covariance and that of the measurement. One
     prism that disagrees is an error of its station. Two that do within :data:`DISAGREEMENT_S` are an error of the IMU: the
     trajectory is as certain of one station as of the others.
+
+    An axis is at its limit where values repeat exactly that its motion and its noise ought to change: successive ones, or the
+    largest of the last half second.
+
+    ``setup_in_doubt``: the mounting may have changed, by a blow or whatever made the samples disagree with the prisms.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, imu: ImuParameters) -> None:
+        self._to_device = np.linalg.inv(np.array(imu.gyro_matrix))
+        self._densities = np.array([imu.noise.gyro_noise_density, imu.noise.accelerometer_noise_density])
         self._now_s = -np.inf
         self._newest_s = -np.inf
         self._problem = ""
         self._problem_s = -np.inf
-        self._last: FloatArray | None = None  # (6,) values of the newest sample
+        self.setup_in_doubt = False
+        self._recent = np.empty((0, 6))  # Values of the device over the last half second
+        self._recent_s = np.empty(0)
+        self._steps = np.full(2, np.inf)  # Smallest change of angular rate and specific force
         self._same_s = 0.0
         self.stuck_from_s = np.inf  # The values have not changed since, for too long
-        self._level_count = np.zeros(6, np.int64)  # Successive samples with the same value of each axis
         self._innovations: deque[tuple[float, int, bool]] = deque()
 
     @property
@@ -75,39 +96,76 @@ class HealthMonitor:
 
     def samples(self, new: InertialSamples) -> NDArray[np.bool_]:
         """Judge samples in the order of time; return which, (N,), can be used but for those after :attr:`stuck_from_s`."""
-        values = np.concatenate([new.angular_rate_radps, new.specific_force_mps2], axis=1)
-        sound: NDArray[np.bool_] = np.isfinite(values).all(axis=1)
-        sound &= np.abs(values[:, :3]).max(axis=1) < MAX_RATE_RADPS
-        sound &= np.abs(values[:, 3:]).max(axis=1) < MAX_FORCE_MPS2
+        rates, forces = new.angular_rate_radps, new.specific_force_mps2
+        sound: NDArray[np.bool_] = np.isfinite(np.concatenate([rates, forces], axis=1)).all(axis=1)
+        sound &= (np.abs(rates).max(axis=1) < MAX_RATE_RADPS) & (np.abs(forces).max(axis=1) < MAX_FORCE_MPS2)
         if not sound.all():
             self._report("values beyond any measuring range", float(new.end_s[~sound][-1]))
-        limits = np.repeat([SATURATED_RATE_RADPS, SATURATED_FORCE_MPS2], 3)
-        tolerance = np.repeat([SATURATED_RATE_CHANGE, 0.0], 3)
-        previous = np.concatenate([values[:1] if self._last is None else self._last[None], values[:-1]])
-        level = (np.abs(values - previous) <= tolerance * np.abs(values)) & (np.abs(values) > limits)
-        same = (values == previous).all(axis=1)
-        if self._last is None:
-            level[0], same[0] = False, False
-        for row in np.flatnonzero(same | level.any(axis=1) | (self._same_s > 0) | self._level_count.any()):
-            self._same_s = self._same_s + float(new.duration_s[row]) if same[row] else 0.0
-            if not same[row]:
+        # Of the device itself: the gyro matrix mixes the axes.
+        values = np.concatenate([rates @ self._to_device.T, forces], axis=1)
+        blows: NDArray[np.bool_] = np.abs(forces).max(axis=1) > BLOW_MPS2
+        blows &= sound
+        if blows.any():
+            self.setup_in_doubt = True
+            self._report("a blow may have displaced it", float(new.end_s[blows][-1]))
+        before = len(self._recent)
+        values = np.concatenate([self._recent, values])
+        same = np.zeros(values.shape, np.bool_)
+        same[1:] = np.abs(np.diff(values, axis=0)) <= _ROUNDING * np.abs(values[1:])
+        self._check_stuck(new, np.logical_and.reduce(same[before:], axis=1))
+        at_limit = self._at_limit(values, same, float(np.median(new.duration_s)))[before:]
+        for sensor, columns in (("angular rate", slice(0, 3)), ("specific force", slice(3, 6))):
+            rows = np.flatnonzero(at_limit[:, columns].any(axis=1))
+            if len(rows):
+                self._report(f"the {sensor} is at the limit of the device", float(new.end_s[rows[-1]]))
+        self._newest_s = max(self._newest_s, float(new.end_s[-1]))
+        self._now_s = max(self._now_s, self._newest_s)
+        times_s = np.concatenate([self._recent_s, new.end_s])
+        kept = np.flatnonzero((times_s > times_s[-1] - LIMIT_SPAN_S) & np.isfinite(values).all(axis=1))
+        self._recent, self._recent_s = values[kept], times_s[kept]
+        sound &= ~(blows | at_limit.any(axis=1))
+        return sound
+
+    def _check_stuck(self, new: InertialSamples, same: NDArray[np.bool_]) -> None:
+        if not same.any() and self._same_s == 0.0:
+            return
+        for row, is_same in enumerate(same.tolist()):
+            self._same_s = self._same_s + float(new.duration_s[row]) if is_same else 0.0
+            if not is_same:
                 self.stuck_from_s = np.inf
-            self._level_count = np.where(level[row], self._level_count + 1, 0)
             if self._same_s >= STUCK_S:
                 self.stuck_from_s = min(self.stuck_from_s, float(new.end_s[row]) - self._same_s)
                 self._report("it repeats the same values", float(new.end_s[row]))
-            elif (self._level_count >= SATURATED_SAMPLES - 1).any():
-                sound[row] = False
-                sensor = (
-                    "angular rate"
-                    if (self._level_count[:3] >= SATURATED_SAMPLES - 1).any()
-                    else "specific force"
-                )
-                self._report(f"the {sensor} is at the limit of the device", float(new.end_s[row]))
-        self._last = values[-1]
-        self._newest_s = max(self._newest_s, float(new.end_s[-1]))
-        self._now_s = max(self._now_s, self._newest_s)
-        return sound
+
+    def _at_limit(self, values: FloatArray, same: NDArray[np.bool_], duration_s: float) -> NDArray[np.bool_]:
+        """Which values, (M, 6), are at the limit of their axis; ``same``: as the one before."""
+        changes = np.where(same[1:], np.inf, np.abs(np.diff(values, axis=0)))
+        self._steps = np.fmin(self._steps, changes.reshape(-1, 2, 3).min(axis=(0, 2), initial=np.inf))
+        found = np.zeros(values.shape, np.bool_)
+        stuck = np.logical_and.reduce(same, axis=1, keepdims=True)
+        same &= ~stuck
+        chance = STEP_SHARE * self._steps * np.sqrt(duration_s) / self._densities
+        log_chance = np.minimum(np.log(np.maximum(chance, MIN_CHANCE)), -1e-9)
+        # As often as chance does not repeat a value.
+        repeated, steps = np.repeat([np.log(LIMIT_CHANCE) / log_chance, self._steps], 3, axis=1)
+        moves = np.ptp(values, axis=0) > MIN_MOTION_STEPS * steps
+        # The accelerometer's vertical axis is far from zero at rest.
+        others_move = np.ones(6, np.bool_)
+        others_move[3:] = moves[[4, 3, 3]] | moves[[5, 5, 4]]
+        rows = np.arange(len(values))[:, None]
+        # Of the run of values that are the same.
+        begin = np.maximum.accumulate(np.where(same, 0, rows), axis=0)
+        long = (rows - begin >= repeated) & (np.abs(values) > MIN_LIMITS) & others_move
+        for axis in np.flatnonzero(long.any(axis=0)):
+            found[:, axis] = np.isin(begin[:, axis], begin[long[:, axis], axis])
+        for sign in (1.0, -1.0):
+            signed = sign * values
+            largest = signed.max(axis=0)
+            at = (signed >= largest - _ROUNDING * np.abs(largest)) & ~stuck
+            count = at.sum(axis=0)
+            near = (signed > largest - LIMIT_STEPS * steps).sum(axis=0) - count
+            found |= at & ((count > repeated) & (count > near) & (largest > MIN_LIMITS) & moves)
+        return found
 
     def innovations(self, time_s: FloatArray, prism: NDArray[np.intp], nis: FloatArray) -> bool:
         """Judge the normalised innovations squared of new measurements; return whether the samples disagree with them."""
@@ -121,6 +179,7 @@ class HealthMonitor:
         alone = len(measured) == 1 and len(newest) == ALONE and all(newest)
         if len(inconsistent) < 2 and not alone:
             return False
+        self.setup_in_doubt = True
         self._report("it disagrees with the prisms", max(self._now_s, float(time_s[-1])))
         self._innovations.clear()
         return True

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry import rotate, rotation_from_quaternion
+from tsgt.geometry import exp_so3, log_so3, rotate, rotation_from_quaternion
 from tsgt.geometry.inertial import InertialSamples
 from tsgt.simulation.imu.arrival import draw_arrivals
 from tsgt.simulation.imu.conditions import Knock, apply_conditions, apply_setup_errors, configured_parameters
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     MotionAt = Callable[[NDArray[np.float64]], RigidMotion]
 
 _NODES, _WEIGHTS = (each / 2 for each in np.polynomial.legendre.leggauss(4))
+KNOCK_S = 0.02
+"""How long the IMU moves when it is knocked: a blow by a stone or a boot."""
+
 _BLOCK = 4096  # samples at once, which bounds memory
 
 
@@ -103,7 +107,8 @@ def ideal_samples(
 ) -> InertialSamples:
     """Return what an IMU without errors measures: mean angular rate and specific force over N intervals, in its axes.
 
-    ``mountings``: from which instant on each applies; the first one from the start. Four-point Gauss quadrature.
+    ``mountings``: from which instant on each applies; the first one from the start, a later one after a knock, which takes
+    :data:`KNOCK_S`. Four-point Gauss quadrature.
     """
     rate, force = np.empty((len(end_s), 3)), np.empty((len(end_s), 3))
     for first in range(0, len(end_s), _BLOCK):
@@ -122,20 +127,41 @@ def _instantaneous(
     times_s: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Angular rate against inertial space and specific force at N instants in the axes of the IMU, (N, 3) each."""
-    to_robot = np.swapaxes(motion.rotation, 1, 2)
-    inertial_rate = motion.angular_rate_radps + rotate(to_robot, environment.earth_rate_radps)
-    rate, force = np.empty_like(inertial_rate), np.empty_like(inertial_rate)
+    rate, force = np.empty((len(times_s), 3)), np.empty((len(times_s), 3))
     starts_s = [-np.inf, *(start_s for start_s, _ in mountings[1:]), np.inf]
+    previous = mountings[0][1]
     for (from_s, until_s), (_, mounting) in zip(pairwise(starts_s), mountings, strict=True):
         rows = (times_s >= from_s) & (times_s < until_s)
-        if not rows.any():
-            continue
-        imu = motion.at_point(mounting.position_m)
-        coriolis = 2.0 * np.cross(environment.earth_rate_radps, imu.velocity_mps)
-        in_robot = rotate(to_robot, imu.acceleration_mps2 + coriolis - environment.gravity_mps2)
-        rate[rows] = inertial_rate[rows] @ mounting.R_robot_imu
-        force[rows] = in_robot[rows] @ mounting.R_robot_imu
+        if rows.any():
+            share = np.clip((times_s[rows] - from_s) / KNOCK_S, 0.0, 1.0)
+            imu = _moving(_select(motion, rows), previous, mounting, share)
+            to_imu = np.swapaxes(imu.rotation, 1, 2)
+            coriolis = 2.0 * np.cross(environment.earth_rate_radps, imu.velocity_mps)
+            rate[rows] = imu.angular_rate_radps + rotate(to_imu, environment.earth_rate_radps)
+            force[rows] = rotate(to_imu, imu.acceleration_mps2 + coriolis - environment.gravity_mps2)
+        previous = mounting
     return rate, force
+
+
+def _select(motion: RigidMotion, rows: NDArray[np.bool_]) -> RigidMotion:
+    return replace(motion, **{each.name: getattr(motion, each.name)[rows] for each in fields(motion)})
+
+
+def _moving(robot: RigidMotion, before: Mounting, after: Mounting, share: NDArray[np.float64]) -> RigidMotion:
+    """Motion of the axes of an IMU on its way from one mounting to another; ``share`` (N,) of the time of a knock."""
+    # From rest to rest, with the least jerk.
+    way = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    speed = 30.0 * share**2 * (1.0 - share) ** 2 / KNOCK_S
+    acceleration = 60.0 * share * (1.0 - share) * (1.0 - 2.0 * share) / KNOCK_S**2
+    displacement = after.position_m - before.position_m
+    turn = log_so3((before.R_robot_imu.T @ after.R_robot_imu)[None])[0]
+    return robot.at_point(
+        before.position_m + way[:, None] * displacement,
+        speed[:, None] * displacement,
+        acceleration[:, None] * displacement,
+    ).turned(
+        before.R_robot_imu @ exp_so3(way[:, None] * turn), speed[:, None] * turn, acceleration[:, None] * turn
+    )
 
 
 def _mountings(mounting: Mounting, knocks: Sequence[Knock]) -> list[tuple[float, Mounting]]:

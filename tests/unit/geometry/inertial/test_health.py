@@ -26,7 +26,7 @@ FAULT_S = 5.0
 
 def judged(samples: InertialSamples) -> tuple[HealthMonitor, NDArray[np.bool_], list[str | None]]:
     """Add lines of ten samples; return the monitor, which samples can be used, and the reason after each line."""
-    monitor, used, reasons = HealthMonitor(), [], []
+    monitor, used, reasons = HealthMonitor(IMU), [], []
     for start in range(0, len(samples), 10):
         used.append(monitor.samples(samples.select(slice(start, start + 10))))
         reasons.append(monitor.reason)
@@ -71,13 +71,100 @@ def test_values_beyond_any_range_are_left_out() -> None:
     assert "values beyond any measuring range" in reasons
 
 
-def test_saturation() -> None:
-    """An axis at its limit: the same high value, but for the little that the gyro matrix adds."""
-    rate = np.tile([0.3, 2.0, 0.1], (40, 1)) + np.linspace(0, 1e-3, 40)[:, None]
-    _, used, reasons = judged(changed(slice(700, 740), rate=rate))
-    assert "the angular rate is at the limit of the device" in reasons
-    assert not used[705:740].any()
-    assert used[:700].all()
+def clipped(samples: InertialSamples, rate: float, force: float, *, from_s: float) -> InertialSamples:
+    """Clip samples from a time on."""
+    late = (samples.end_s >= from_s)[:, None]
+    return replace(
+        samples,
+        angular_rate_radps=np.where(
+            late, samples.angular_rate_radps.clip(-rate, rate), samples.angular_rate_radps
+        ),
+        specific_force_mps2=np.where(
+            late, samples.specific_force_mps2.clip(-force, force), samples.specific_force_mps2
+        ),
+    )
+
+
+def quantised(samples: InertialSamples, step: float) -> InertialSamples:
+    """Round angular rates and forces, the latter to ten steps."""
+    return replace(
+        samples,
+        angular_rate_radps=np.round(samples.angular_rate_radps / step) * step,
+        specific_force_mps2=np.round(samples.specific_force_mps2 / (10 * step)) * 10 * step,
+    )
+
+
+@pytest.mark.parametrize("step", [1e-7, 2e-4, 3e-3], ids=["fine", "chip", "coarse"])
+def test_values_of_any_resolution_are_believed(step: float) -> None:
+    """Also if the noise at rest does not change them."""
+    samples = quantised(DRIVE.shaken(IMU).samples(IMU), step)
+    resting = quantised(at_rest(), step)
+    for each in (samples, resting):
+        _, used, reasons = judged(each)
+        assert used.all()
+        assert {each for each in reasons if each != "it repeats the same values"} == {None}
+
+
+def at_rest() -> InertialSamples:
+    """Return noise and gravity."""
+    rng = np.random.default_rng(3)
+    root_hz = np.sqrt(200.0)
+    size = (len(SAMPLES), 3)
+    return replace(
+        SAMPLES,
+        angular_rate_radps=0.01 + rng.normal(0.0, IMU.noise.gyro_noise_density * root_hz, size),
+        specific_force_mps2=rng.normal(
+            [0.3, -0.2, 9.8], IMU.noise.accelerometer_noise_density * root_hz, size
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("rate", "force", "sensor"), [(0.1, 99.0, "angular rate"), (9.0, 11.0, "specific force")]
+)
+@pytest.mark.parametrize("step", [1e-6, 2e-4])
+def test_saturation(rate: float, force: float, sensor: str, step: float) -> None:
+    """An axis whose largest value comes again and again is at its limit, whatever the gyro matrix mixes."""
+    matrix = ((1.0, 3e-3, -2e-3), (4e-3, 1.0, 1e-3), (2e-3, 2e-3, 1.0))
+    samples = clipped(quantised(DRIVE.shaken(IMU).samples(IMU), step), rate, force, from_s=1.0)
+    limited = (np.abs(samples.angular_rate_radps) == rate) | (np.abs(samples.specific_force_mps2) == force)
+    samples = replace(samples, angular_rate_radps=samples.angular_rate_radps @ np.array(matrix).T)
+    monitor, used, reasons = HealthMonitor(replace(IMU, gyro_matrix=matrix)), [], []
+    for start in range(0, len(samples), 10):
+        used.append(monitor.samples(samples.select(slice(start, start + 10))))
+        reasons.append(monitor.reason)
+    assert {each for each in reasons if each} == {f"the {sensor} is at the limit of the device"}
+    bad = limited.any(axis=1)
+    assert np.concatenate(used)[~bad].all()
+    assert np.count_nonzero(~np.concatenate(used)[bad]) > 0.2 * np.count_nonzero(bad)
+
+
+def test_axis_that_is_at_its_limit_at_once_is_noticed_within_a_line_or_two() -> None:
+    """Four successive values that noise would change; the others move."""
+    samples = changed(
+        slice(704, 740),
+        rate=np.stack(
+            [
+                0.3 + SAMPLES.angular_rate_radps[704:740, 0],
+                np.full(36, 0.3),
+                SAMPLES.angular_rate_radps[704:740, 2],
+            ],
+            axis=1,
+        ),
+    )
+    _, used, reasons = judged(quantised(samples, 1e-6))
+    assert reasons.index("the angular rate is at the limit of the device") == 70
+    assert not used[704:740].any()
+
+
+def test_blow_puts_the_setup_in_doubt() -> None:
+    """For good."""
+    monitor, used, reasons = judged(changed(slice(700, 702), force=np.array([0.0, 90.0, 9.0])))
+    assert np.flatnonzero(~used).tolist() == [700, 701]
+    assert "a blow may have displaced it" in reasons
+    assert reasons[-1] is None
+    assert monitor.setup_in_doubt
+    assert not judged(SAMPLES)[0].setup_in_doubt
 
 
 def test_old_samples() -> None:
@@ -93,7 +180,7 @@ def test_old_samples() -> None:
 
 def test_one_station_that_disagrees_is_not_the_imu() -> None:
     """Two prisms accuse the IMU, one its own station, and one alone the IMU."""
-    monitor = HealthMonitor()
+    monitor = HealthMonitor(IMU)
     for i in range(12):
         prism = i % 3
         assert not monitor.innovations(
@@ -101,7 +188,7 @@ def test_one_station_that_disagrees_is_not_the_imu() -> None:
         )
     assert monitor.innovations(np.array([1.6]), np.array([0]), np.array([30.0]))
     assert monitor.reason == "it disagrees with the prisms"
-    alone = HealthMonitor()
+    alone = HealthMonitor(IMU)
     found = [alone.innovations(np.array([0.4 * i]), np.array([0]), np.array([40.0])) for i in range(3)]
     assert found == [False, False, True]
 

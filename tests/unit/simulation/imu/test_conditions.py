@@ -136,6 +136,25 @@ def test_knock_turns_the_axes_and_moves_the_origin() -> None:
     np.testing.assert_allclose(change, expected, atol=3e-3)
 
 
+def test_knock_is_part_of_the_motion() -> None:
+    """The gyro measures the turn, the accelerometer a blow that moves the origin from rest to rest."""
+    knock = Knock(2.0, (0.0, 0.02, 0.0), (0.003, 0.0, 0.0))
+    sound, knocked = _run().samples, _run(knock).samples
+    during = (sound.end_s > 2.0) & (sound.end_s < 2.03)
+    rate, force = (
+        (getattr(knocked, name) - getattr(sound, name))[during]
+        for name in ("angular_rate_radps", "specific_force_mps2")
+    )
+    period_s = sound.duration_s[during][:, None]
+    # Of the turntable's rotation and of gravity in the new axes there is little in 30 ms.
+    np.testing.assert_allclose((rate * period_s).sum(axis=0), knock.rotation_rad, atol=1e-3)
+    robot = force @ mounting_of(CONFIG).R_robot_imu.T
+    assert robot[:, 0].max() > 20.0
+    velocity = np.cumsum(robot * period_s, axis=0)[:, 0]
+    assert abs(velocity[-1]) < 0.01
+    assert (velocity * period_s[:, 0]).sum() == pytest.approx(0.003, abs=2e-4)
+
+
 @pytest.mark.parametrize("name", ["axes_swapped", "degrees", "gravity_inverted"])
 def test_setup_errors_of_the_program(name: str) -> None:
     """Axes are exchanged, rates are in degrees, the force has the wrong sign; nothing else changes."""

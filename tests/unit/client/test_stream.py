@@ -1,0 +1,246 @@
+"""Both faces against servers on real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import socket
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+from harness.records import EVENT, HELLO, NO_POSE, POSE, STATUS, measurement
+
+from tsgt.client import AsyncStream, Event, Gap, Hello, Pose, ProtocolVersionError, Status, Stream
+from tsgt.errors import StreamError
+from tsgt.recording import encode_line
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from tsgt.client import Record
+
+MS = 1_000_000
+PREDICTED = replace(POSE, kind="predicted")
+
+
+def lines(*records: object) -> bytes:
+    """Return records as on the wire."""
+    return b"".join(
+        record + b"\n" if isinstance(record, bytes) else encode_line(record) + b"\n" for record in records
+    )
+
+
+def predicted(number: int) -> object:
+    """Return one of the predicted poses, 50 ms apart."""
+    return replace(PREDICTED, stamp_ns=PREDICTED.stamp_ns + number * 50 * MS)
+
+
+@contextmanager
+def serving(path: Path, *connections: bytes) -> Iterator[None]:
+    """Serve each connection its bytes and close it."""
+
+    def serve() -> None:
+        for data in connections:
+            connection, _ = listener.accept()
+            with connection:
+                connection.sendall(data)
+
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield
+        thread.join(10)
+
+
+async def _gather(path: Path, count: int, *, reconnect: bool) -> list[Record]:
+    found: list[Record] = []
+    async with AsyncStream(path, reconnect=reconnect) as stream:
+        async for record in stream:
+            found.append(record)
+            if len(found) == count:
+                break
+    return found
+
+
+def _plain(path: Path, count: int, *, reconnect: bool) -> list[Record]:
+    with Stream(path, reconnect=reconnect) as stream:
+        return list(itertools.islice(stream, count))
+
+
+def _asyncio(path: Path, count: int, *, reconnect: bool) -> list[Record]:
+    return asyncio.run(_gather(path, count, reconnect=reconnect))
+
+
+both = pytest.mark.parametrize("read", [_plain, _asyncio])
+
+
+@both
+def test_records_arrive_in_order(tmp_path: Path, read: Callable[..., list[Record]]) -> None:
+    """Of the types that the client knows; the end of the stream is the end."""
+    sent = (HELLO, measurement(0), b'{"type":"weather"}', PREDICTED, STATUS, NO_POSE)
+    with serving(tmp_path / "s", lines(*sent)):
+        found = read(tmp_path / "s", 99, reconnect=False)
+    assert [type(record) for record in found] == [Hello, Pose, Status, Pose]
+
+
+@both
+def test_reconnection_is_told_as_a_gap(tmp_path: Path, read: Callable[..., list[Record]]) -> None:
+    """After the master's end the next one's lines follow."""
+    with serving(tmp_path / "s", lines(HELLO, predicted(0)), lines(HELLO, predicted(1))):
+        found = read(tmp_path / "s", 5, reconnect=True)
+    assert [type(record) for record in found] == [Hello, Pose, Gap, Hello, Pose]
+
+
+@both
+def test_another_protocol_is_an_error(tmp_path: Path, read: Callable[..., list[Record]]) -> None:
+    """Also when it would reconnect."""
+    with serving(tmp_path / "s", b'{"type":"hello","protocol":2}\n'), pytest.raises(ProtocolVersionError):
+        read(tmp_path / "s", 1, reconnect=True)
+
+
+@both
+def test_missing_socket_is_an_error_without_reconnection(
+    tmp_path: Path, read: Callable[..., list[Record]]
+) -> None:
+    """It says which socket."""
+    with pytest.raises(StreamError, match=f"{tmp_path}/s: No such file"):
+        read(tmp_path / "s", 1, reconnect=False)
+
+
+@both
+def test_lost_lines_are_told_as_a_gap(tmp_path: Path, read: Callable[..., list[Record]]) -> None:
+    """With their number."""
+    with serving(tmp_path / "s", lines(HELLO, EVENT)):
+        found = read(tmp_path / "s", 99, reconnect=False)
+    assert isinstance(found[1], Event)
+    assert found[2] == Gap(lines=7, reason="this reader was too slow for the master")
+
+
+@both
+def test_unusable_line_is_told_as_a_gap(tmp_path: Path, read: Callable[..., list[Record]]) -> None:
+    """The stream goes on behind it."""
+    with serving(tmp_path / "s", lines(HELLO, b'{"type":"pose"}', b"?", PREDICTED)):
+        found = read(tmp_path / "s", 99, reconnect=False)
+    assert [type(record) for record in found] == [Hello, Gap, Gap, Pose]
+
+
+@both
+def test_what_is_no_stream_is_an_error(tmp_path: Path, read: Callable[..., list[Record]]) -> None:
+    """Such as another service's socket."""
+    with (
+        serving(tmp_path / "s", b"220 mail ready\n"),
+        pytest.raises(StreamError, match="not a line of a tsgt stream"),
+    ):
+        read(tmp_path / "s", 99, reconnect=False)
+
+
+@contextmanager
+def clocked(tmp_path: Path) -> Iterator[tuple[Stream, socket.socket, list[int]]]:
+    """Give a stream with a clock that the test sets, and the server's end of its connection."""
+    now_ns = [10**12]
+    with (
+        socket.socket(socket.AF_UNIX) as listener,
+        Stream(tmp_path / "s", now_ns=lambda: now_ns[0]) as stream,
+    ):
+        listener.bind(str(tmp_path / "s"))
+        listener.listen()
+        assert stream.latest() is None
+        connection, _ = listener.accept()
+        with connection:
+            yield stream, connection, now_ns
+
+
+def test_latest_pose_becomes_stale(tmp_path: Path) -> None:
+    """It is handed out until half a second after its epoch."""
+    with clocked(tmp_path) as (stream, server, now_ns):
+        server.sendall(lines(HELLO, predicted(0)))
+        assert isinstance(stream.latest(), Pose)
+        now_ns[0] += 500 * MS
+        assert isinstance(stream.latest(), Pose)
+        now_ns[0] += 1
+        assert stream.latest() is None
+        assert isinstance(stream.latest(max_age_s=1.0), Pose)
+
+
+def test_delayed_pose_is_not_taken_for_a_new_one(tmp_path: Path) -> None:
+    """Its age counts from its epoch, not from its arrival."""
+    with clocked(tmp_path) as (stream, server, now_ns):
+        server.sendall(lines(HELLO, predicted(0)))
+        stream.latest()
+        now_ns[0] += 650 * MS
+        server.sendall(lines(predicted(1)))
+        assert stream.latest() is None
+        pose = stream.latest(max_age_s=1.0)
+        assert pose is not None
+        assert pose.age_s(now_ns[0]) == pytest.approx(0.6, abs=1e-3)
+
+
+def test_stale_poses_are_skipped(tmp_path: Path) -> None:
+    """An iterator that comes late gets what is fresh, and the rest is counted."""
+    with clocked(tmp_path) as (stream, server, now_ns):
+        server.sendall(lines(HELLO, predicted(0)))
+        poses = stream.poses()
+        next(poses)
+        now_ns[0] += 2000 * MS
+        server.sendall(lines(*map(predicted, range(1, 41))))
+        assert next(poses).stamp_ns == PREDICTED.stamp_ns + 30 * 50 * MS
+        assert stream.stale_poses == 29
+
+
+def test_invalid_poses_are_left_out(tmp_path: Path) -> None:
+    """Unless they are wanted."""
+    with clocked(tmp_path) as (stream, server, _):
+        server.sendall(lines(HELLO, NO_POSE))
+        assert stream.latest() is None
+        assert stream.latest(include_invalid=True) is not None
+
+
+def test_series_are_told_apart(tmp_path: Path) -> None:
+    """Smoothed poses are no live poses."""
+    smoothed = replace(POSE, kind="smoothed", delay_s=1.0)
+    with clocked(tmp_path) as (stream, server, _):
+        server.sendall(lines(HELLO, smoothed))
+        assert stream.latest() is None
+        assert stream.latest("smoothed_1s") is not None
+        assert stream.latest("smoothed") is None
+
+
+def test_new_session_takes_its_own_clock(tmp_path: Path) -> None:
+    """A master whose Unix clock was set back a day meanwhile gives fresh poses."""
+    day = 86_400_000 * MS
+    with clocked(tmp_path) as (stream, server, now_ns):
+        server.sendall(lines(HELLO, predicted(0)))
+        stream.latest()
+        now_ns[0] += 1000 * MS
+        server.sendall(lines(HELLO))
+        assert stream.latest(max_age_s=99) is None
+        server.sendall(lines(replace(PREDICTED, stamp_ns=PREDICTED.stamp_ns - day)))
+        assert stream.latest() is not None
+
+
+def test_two_iterators_get_everything(tmp_path: Path) -> None:
+    """With asyncio, poses and events can be followed side by side."""
+
+    async def follow() -> tuple[int, int]:
+        async with AsyncStream(tmp_path / "s", reconnect=False) as stream:
+
+            async def poses() -> int:
+                return len([pose async for pose in stream.poses()])
+
+            async def events() -> int:
+                return len([event async for event in stream.events()])
+
+            both = await asyncio.gather(poses(), events())
+            assert stream.latest() is not None
+            return both[0], both[1]
+
+    with serving(
+        tmp_path / "s", lines(HELLO, predicted(0), replace(EVENT, stamp_ns=POSE.stamp_ns), predicted(1))
+    ):
+        assert asyncio.run(follow()) == (2, 1)

@@ -1,0 +1,59 @@
+"""The stream of poses for programs of yours, on the robot or on another computer.
+
+In: the master's UNIX socket, or a relay (`relay_wire` is its protocol). Out: typed records; poses know their age, and a
+stale one is never handed out as new. The standard library alone, so that a small computer loads it in some ten
+milliseconds; `records` has the fields. `links` and `decoder` are sans-I/O, `pump` has the connection, and `blocking` and
+`asynchronous` are the two faces.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from tsgt.client.blocking import Stream
+from tsgt.client.decoder import ProtocolVersionError
+from tsgt.client.records import (
+    PROTOCOL_VERSION,
+    Event,
+    Gap,
+    Hello,
+    ImuStatus,
+    Pose,
+    Record,
+    StationShare,
+    StationStatus,
+    Status,
+    ValidityLimits,
+)
+from tsgt.client.relay_wire import AuthenticationError
+from tsgt.client.stream import LIVE, default_max_age_s
+
+if TYPE_CHECKING:
+    from tsgt.client.asynchronous import AsyncStream
+
+__all__ = [
+    "LIVE",
+    "PROTOCOL_VERSION",
+    "AsyncStream",
+    "AuthenticationError",
+    "Event",
+    "Gap",
+    "Hello",
+    "ImuStatus",
+    "Pose",
+    "ProtocolVersionError",
+    "Record",
+    "StationShare",
+    "StationStatus",
+    "Status",
+    "Stream",
+    "ValidityLimits",
+    "default_max_age_s",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load asyncio, which takes longer than all the rest, only for those who use it."""
+    if name == "AsyncStream":
+        from tsgt.client.asynchronous import AsyncStream  # noqa: PLC0415 (as above)
+
+        return AsyncStream
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

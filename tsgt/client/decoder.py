@@ -1,0 +1,78 @@
+"""Sans-I/O: lines become records, and each pose learns its place on the clock of this computer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tsgt.client.delay import LeastDelay
+from tsgt.client.records import PROTOCOL_VERSION, TYPES, Event, Gap, Pose, Record, build, load
+from tsgt.errors import StreamError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tsgt.client.links import Arrival, Link
+
+_MADE_KEY = {
+    "status": "stamp_ns",
+    "event": "stamp_ns",
+    "measurement": "received_ns",
+    "point": "received_ns",
+}
+"""Of lines that are sent as soon as they are made: the key of that time on the master's Unix clock."""
+
+
+class Decoder:
+    """Decodes the lines of a link."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._delay = LeastDelay()
+        self.greeted = False
+        """Whether there was a greeting."""
+
+    def decode(self, arrival: Arrival) -> Iterator[Record]:
+        """Yield the records of a line, none for an unknown type; raises StreamError for another protocol or a wrong line."""
+        data = load(arrival.line)
+        kind = data["type"]
+        if kind == "hello":
+            protocol = data.get("protocol")
+            if protocol != PROTOCOL_VERSION:
+                raise ProtocolVersionError(
+                    f"the stream has protocol version {protocol}, this program supports version {PROTOCOL_VERSION}"
+                )
+            self.greeted = True
+            self._delay = LeastDelay()  # the Unix clock of the next session may differ
+        elif not self.greeted:
+            raise StreamError("the stream does not begin with a greeting: not a stream of tsgt")
+        if (made_ns := _made_ns(kind, data)) is not None:
+            self._delay.sample(made_ns, arrival.arrived_ns)
+        cls = TYPES.get(kind)
+        if cls is None:
+            return
+        if cls is not Pose:
+            record = build(cls, data)
+            yield record
+            if isinstance(record, Event) and record.event == "lines_lost":
+                yield Gap(lines=record.count, reason="this reader was too slow for the master")
+            return
+        yield build(Pose, data, epoch_ns=self._epoch_ns(data, arrival))
+
+    def _epoch_ns(self, data: dict[str, Any], arrival: Arrival) -> int:
+        stamp_ns = data.get("stamp_ns")
+        if not isinstance(stamp_ns, int):
+            raise StreamError("a pose has no integer stamp_ns")
+        at_ns = self._delay.here_ns(stamp_ns) if self._delay.known else arrival.arrived_ns
+        return self._link.here_ns(at_ns)
+
+
+class ProtocolVersionError(StreamError):
+    """The stream is of another version, which this program would misread; trying again does not help."""
+
+
+def _made_ns(kind: str, data: dict[str, Any]) -> int | None:
+    if kind == "pose":
+        made_ns = data.get("stamp_ns") if data.get("kind") == "predicted" else None
+    else:
+        made_ns = data.get(_MADE_KEY.get(kind, ""))
+    return made_ns if isinstance(made_ns, int) else None

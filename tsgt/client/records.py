@@ -1,0 +1,297 @@
+"""Records of the stream as frozen data classes, built from JSON with the standard library alone.
+
+docs/reference/stream.md defines the fields. The master's own definitions need pydantic, which costs a small computer a
+quarter of a second and 14 MB; a test compares these classes with the schema that is generated from them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import MISSING, Field, dataclass, fields
+from functools import cache
+from typing import Any, ClassVar, Literal, NoReturn, TypeVar
+
+from tsgt.errors import StreamError
+
+PROTOCOL_VERSION = 1
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Kind = Literal["predicted", "interpolated", "smoothed"]
+
+T = TypeVar("T")
+
+_SHOWN_CHARACTERS = 80
+
+
+def monotonic_ns() -> int:
+    """Return a clock of this computer that is never set, and also counts while it is suspended, in ns."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValidityLimits:
+    """What ``valid`` promises of a pose, with the limits in force."""
+
+    promise: str
+    reference_point: str
+    position_sigma_m: float | None
+    rotation_sigma_rad: float | None
+    predicted_position_sigma_m: float | None
+    predicted_rotation_sigma_rad: float | None
+    residual_m: float
+    tilt_rad: float
+    outage_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hello:
+    """The greeting: another master, or the same one restarted, serves the stream from here on."""
+
+    nested: ClassVar[dict[str, type]] = {"limits": ValidityLimits}
+
+    protocol: int
+    version: str
+    capabilities: tuple[str, ...]
+    limits: ValidityLimits | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StationShare:
+    """The contribution of one station to a pose, or why there is none."""
+
+    id: int
+    prism: int
+    age_s: float | None
+    residual_m: float | None
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pose:
+    """The pose of the robot at one epoch, or why there is none."""
+
+    nested: ClassVar[dict[str, type]] = {"stations": StationShare}
+    sizes: ClassVar[dict[str, int]] = {
+        "position_m": 3,
+        "orientation_xyzw": 4,
+        "covariance": 36,
+        "covariance_common": 36,
+        "velocity_mps": 3,
+        "angular_velocity_radps": 3,
+    }
+
+    stamp_ns: int
+    frame: str
+    child_frame: str
+    position_m: Vector3 | None
+    orientation_xyzw: Quaternion | None
+    covariance: tuple[float, ...] | None
+    covariance_common: tuple[float, ...] | None = None
+    velocity_mps: Vector3 | None
+    angular_velocity_radps: Vector3 | None
+    estimator: str
+    kind: Kind
+    delay_s: float | None = None
+    imu: str | None = None
+    jump_m: float | None = None
+    jump_rad: float | None = None
+    valid: bool
+    reason: str
+    quality: str | None = None
+    degraded_by: tuple[str, ...] = ()
+    residual_m: float | None
+    stations: tuple[StationShare, ...]
+    epoch_ns: int = 0
+    """Time of the pose on :func:`monotonic_ns` of this computer; see :meth:`age_s`."""
+
+    @property
+    def series(self) -> str:
+        """Name of the poses that belong together, one per epoch: their kind, with their delay as in ``smoothed_1s``."""
+        return self.kind if self.delay_s is None else f"{self.kind}_{self.delay_s:g}s"
+
+    def age_s(self, now_ns: int | None = None) -> float:
+        """Return the time since the pose's epoch in s, by this computer's clock alone.
+
+        The least delay that any line has had counts as none, so the age is too small by that delay: below a millisecond
+        on the robot, the network's one-way delay elsewhere. ``now_ns``: :func:`monotonic_ns`; None: now.
+        """
+        return ((monotonic_ns() if now_ns is None else now_ns) - self.epoch_ns) / 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StationStatus:
+    """The status of one station."""
+
+    id: int
+    measurements: int
+    usable: int
+    age_s: float | None
+    status: str | None
+    prism: int | None = None
+    locked: bool | None = None
+    answering: bool | None = None
+    last_heard_s: float | None = None
+    rate_hz: float | None = None
+    loss: float | None = None
+    rssi_dbm: float | None = None
+    snr_db: float | None = None
+    clock_offset_ns: int | None = None
+    clock_bound_ns: int | None = None
+    stamp_bound_ns: int | None = None
+    joined: bool | None = None
+    outstanding: int | None = None
+    missed_slots: int | None = None
+    rejected_beacons: int | None = None
+    outside_lag_window: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuStatus:
+    """The status of the robot's IMU."""
+
+    sizes: ClassVar[dict[str, int]] = {"gyro_bias_radps": 3, "accelerometer_bias_mps2": 3}
+
+    device: str
+    samples: int
+    rate_hz: float | None
+    age_s: float | None
+    gaps: int
+    lost: int
+    saturated: int
+    clock_skew_ppm: float | None
+    problem: str
+    use: str | None = None
+    disagreement: str = ""
+    gyro_bias_radps: Vector3 | None = None
+    accelerometer_bias_mps2: Vector3 | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Status:
+    """The status of the master and its stations, about once per second."""
+
+    nested: ClassVar[dict[str, type]] = {"stations": StationStatus, "imu": ImuStatus}
+
+    stamp_ns: int
+    poses: int
+    valid_poses: int
+    stations: tuple[StationStatus, ...]
+    protocol: str | None = None
+    authenticated: bool | None = None
+    frame_ms: float | None = None
+    imu: ImuStatus | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Event:
+    """An event that a reader may want to act on."""
+
+    stamp_ns: int
+    event: str
+    message: str
+    station: int | None = None
+    count: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gap:
+    """Lines are missing here."""
+
+    lines: int | None
+    """How many; None where that is not known."""
+    reason: str
+    """Why, in one line."""
+
+
+Record = Hello | Pose | Status | Event | Gap
+
+TYPES: dict[str, type[Hello | Pose | Status | Event]] = {
+    "hello": Hello,
+    "pose": Pose,
+    "status": Status,
+    "event": Event,
+}
+"""Types of lines that become records; all others are ignored."""
+
+
+def load(line: bytes) -> dict[str, Any]:
+    """Return the JSON object of a line; raises StreamError if it is none, or has no type."""
+    try:
+        loaded = json.loads(line, parse_constant=_reject)
+    except (ValueError, RecursionError) as error:
+        raise StreamError(f"not a line of a tsgt stream ({error}): {_shown(line)}") from error
+    if not isinstance(loaded, dict) or not isinstance(loaded.get("type"), str):
+        raise StreamError(f"not a line of a tsgt stream: {_shown(line)}")
+    return loaded
+
+
+def build(cls: type[T], data: dict[str, Any], **more: Any) -> T:
+    """Build a record from a JSON object, ignoring unknown keys; raises StreamError for a missing or wrong field."""
+    values: dict[str, Any] = more
+    nested: dict[str, type] = getattr(cls, "nested", {})
+    sizes: dict[str, int] = getattr(cls, "sizes", {})
+    for field in fields(cls):  # type: ignore[arg-type]  # T is one of the classes above
+        name = field.name
+        if name in more:
+            continue
+        if name not in data:
+            if field.default is MISSING:
+                raise StreamError(f"a line of the stream has no field {name}, which {cls.__name__} needs")
+            continue
+        value = data[name]
+        try:
+            if name in nested and value is not None:
+                inner = nested[name]
+                value = (
+                    tuple(build(inner, item) for item in value)
+                    if isinstance(value, list)
+                    else build(inner, value)
+                )
+            elif name in sizes and value is not None:
+                value = _numbers(value, sizes[name])
+            elif isinstance(value, list):
+                value = tuple(value)
+            elif not isinstance(value, _json_types(field)):
+                raise TypeError(f"{_shown(repr(value).encode())} is not {field.type}")
+        except (TypeError, ValueError) as error:
+            raise StreamError(
+                f"the field {name} of a line of type {data.get('type')} is wrong: {error}"
+            ) from error
+        values[name] = value
+    return cls(**values)
+
+
+@cache
+def _json_types_of(annotation: str) -> tuple[type, ...]:
+    names = {name.strip() for name in annotation.split("|")}
+    kinds: dict[str, tuple[type, ...]] = {
+        "int": (int,),
+        "float": (float, int),
+        "bool": (bool,),
+        "None": (type(None),),
+    }
+    return tuple(kind for name in names for kind in kinds.get(name, (str,)))
+
+
+def _json_types(field: Field[Any]) -> tuple[type, ...]:
+    return _json_types_of(str(field.type))
+
+
+def _numbers(value: Any, size: int) -> tuple[float, ...]:
+    if not isinstance(value, list) or len(value) != size:
+        raise ValueError(f"expected {size} numbers")
+    numbers = tuple(float(number) for number in value)
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("not finite")
+    return numbers
+
+
+def _reject(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def _shown(line: bytes) -> str:
+    return repr(line[:_SHOWN_CHARACTERS].decode(errors="replace"))

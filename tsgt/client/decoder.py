@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from tsgt.client.build import TYPES, build, load
 from tsgt.client.delay import LeastDelay
-from tsgt.client.records import PROTOCOL_VERSION, TYPES, Event, Gap, Pose, Record, build, load
+from tsgt.client.records import PROTOCOL_VERSION, Event, Gap, Pose, Record
 from tsgt.errors import StreamError
 
 if TYPE_CHECKING:

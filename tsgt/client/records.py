@@ -6,24 +6,15 @@ quarter of a second and 14 MB; a test compares these classes with the schema tha
 
 from __future__ import annotations
 
-import json
-import math
 import time
-from dataclasses import MISSING, Field, dataclass, fields
-from functools import cache
-from typing import Any, ClassVar, Literal, NoReturn, TypeVar
-
-from tsgt.errors import StreamError
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 PROTOCOL_VERSION = 1
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Kind = Literal["predicted", "interpolated", "smoothed"]
-
-T = TypeVar("T")
-
-_SHOWN_CHARACTERS = 80
 
 
 def monotonic_ns() -> int:
@@ -56,6 +47,83 @@ class Hello:
     version: str
     capabilities: tuple[str, ...]
     limits: ValidityLimits | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferencePoint:
+    """A point of the robot, with axes."""
+
+    sizes: ClassVar[dict[str, int]] = {"position_m": 3, "orientation_xyzw": 4}
+
+    name: str
+    position_m: Vector3
+    orientation_xyzw: Quaternion
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetupStation:
+    """The frame of one station, and what it tracks."""
+
+    sizes: ClassVar[dict[str, int]] = {"position_m": 3, "orientation_xyzw": 4, "covariance": 36}
+
+    id: int
+    position_m: Vector3
+    orientation_xyzw: Quaternion
+    covariance: tuple[float, ...] | None
+    instrument: str | None = None
+    latency_s: float
+    prism: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetupPrism:
+    """One prism on the robot."""
+
+    sizes: ClassVar[dict[str, int]] = {"position_m": 3}
+
+    id: int
+    station: int | None
+    position_m: Vector3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetupGeofence:
+    """One geofence."""
+
+    name: str
+    allowed_side: str
+    polygon_m: tuple[tuple[float, float], ...]
+    margin_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setup:
+    """The set-up in force: after each greeting, and again whenever it changes."""
+
+    nested: ClassVar[dict[str, type]] = {
+        "reference_point": ReferencePoint,
+        "limits": ValidityLimits,
+        "stations": SetupStation,
+        "prisms": SetupPrism,
+        "geofences": SetupGeofence,
+    }
+
+    stamp_ns: int
+    frame: str
+    child_frame: str
+    reference_point: ReferencePoint
+    estimator: str
+    protocol: str | None = None
+    authenticated: bool | None = None
+    rate_hz: float
+    lag_s: float | None
+    smoothed_delays_s: tuple[float, ...]
+    limits: ValidityLimits
+    stations: tuple[SetupStation, ...]
+    prisms: tuple[SetupPrism, ...]
+    geofences: tuple[SetupGeofence, ...] = ()
+    imu: bool
+    recording: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,6 +214,9 @@ class StationStatus:
     missed_slots: int | None = None
     rejected_beacons: int | None = None
     outside_lag_window: int | None = None
+    battery_percent: int | None = None
+    atmospheric_ppm: float | None = None
+    last_target_check_age_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,10 +241,34 @@ class ImuStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingStatus:
+    """The status of the recording."""
+
+    file: str
+    bytes: int
+    last_write_ns: int | None
+    waiting_lines: int
+    lost_lines: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiskStatus:
+    """The space on the disk of the recording."""
+
+    free_bytes: int
+    total_bytes: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
     """The status of the master and its stations, about once per second."""
 
-    nested: ClassVar[dict[str, type]] = {"stations": StationStatus, "imu": ImuStatus}
+    nested: ClassVar[dict[str, type]] = {
+        "stations": StationStatus,
+        "imu": ImuStatus,
+        "recording": RecordingStatus,
+        "disk": DiskStatus,
+    }
 
     stamp_ns: int
     poses: int
@@ -183,6 +278,8 @@ class Status:
     authenticated: bool | None = None
     frame_ms: float | None = None
     imu: ImuStatus | None = None
+    recording: RecordingStatus | None = None
+    disk: DiskStatus | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -206,92 +303,4 @@ class Gap:
     """Why, in one line."""
 
 
-Record = Hello | Pose | Status | Event | Gap
-
-TYPES: dict[str, type[Hello | Pose | Status | Event]] = {
-    "hello": Hello,
-    "pose": Pose,
-    "status": Status,
-    "event": Event,
-}
-"""Types of lines that become records; all others are ignored."""
-
-
-def load(line: bytes) -> dict[str, Any]:
-    """Return the JSON object of a line; raises StreamError if it is none, or has no type."""
-    try:
-        loaded = json.loads(line, parse_constant=_reject)
-    except (ValueError, RecursionError) as error:
-        raise StreamError(f"not a line of a tsgt stream ({error}): {_shown(line)}") from error
-    if not isinstance(loaded, dict) or not isinstance(loaded.get("type"), str):
-        raise StreamError(f"not a line of a tsgt stream: {_shown(line)}")
-    return loaded
-
-
-def build(cls: type[T], data: dict[str, Any], **more: Any) -> T:
-    """Build a record from a JSON object, ignoring unknown keys; raises StreamError for a missing or wrong field."""
-    values: dict[str, Any] = more
-    nested: dict[str, type] = getattr(cls, "nested", {})
-    sizes: dict[str, int] = getattr(cls, "sizes", {})
-    for field in fields(cls):  # type: ignore[arg-type]  # T is one of the classes above
-        name = field.name
-        if name in more:
-            continue
-        if name not in data:
-            if field.default is MISSING:
-                raise StreamError(f"a line of the stream has no field {name}, which {cls.__name__} needs")
-            continue
-        value = data[name]
-        try:
-            if name in nested and value is not None:
-                inner = nested[name]
-                value = (
-                    tuple(build(inner, item) for item in value)
-                    if isinstance(value, list)
-                    else build(inner, value)
-                )
-            elif name in sizes and value is not None:
-                value = _numbers(value, sizes[name])
-            elif isinstance(value, list):
-                value = tuple(value)
-            elif not isinstance(value, _json_types(field)):
-                raise TypeError(f"{_shown(repr(value).encode())} is not {field.type}")
-        except (TypeError, ValueError) as error:
-            raise StreamError(
-                f"the field {name} of a line of type {data.get('type')} is wrong: {error}"
-            ) from error
-        values[name] = value
-    return cls(**values)
-
-
-@cache
-def _json_types_of(annotation: str) -> tuple[type, ...]:
-    names = {name.strip() for name in annotation.split("|")}
-    kinds: dict[str, tuple[type, ...]] = {
-        "int": (int,),
-        "float": (float, int),
-        "bool": (bool,),
-        "None": (type(None),),
-    }
-    return tuple(kind for name in names for kind in kinds.get(name, (str,)))
-
-
-def _json_types(field: Field[Any]) -> tuple[type, ...]:
-    return _json_types_of(str(field.type))
-
-
-def _numbers(value: Any, size: int) -> tuple[float, ...]:
-    if not isinstance(value, list) or len(value) != size:
-        raise ValueError(f"expected {size} numbers")
-    numbers = tuple(float(number) for number in value)
-    if not all(map(math.isfinite, numbers)):
-        raise ValueError("not finite")
-    return numbers
-
-
-def _reject(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is not JSON")
-
-
-def _shown(line: bytes) -> str:
-    return repr(line[:_SHOWN_CHARACTERS].decode(errors="replace"))
+Record = Hello | Setup | Pose | Status | Event | Gap

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from tsgt.client.pump import Pump
-from tsgt.client.records import Gap, Hello, Pose, Record, Status, monotonic_ns
+from tsgt.client.records import Gap, Hello, Pose, Record, Setup, Status, monotonic_ns
 from tsgt.client.source import DEFAULT_SOCKET, RelaySource, parse_source, read_key_file
 
 if TYPE_CHECKING:
@@ -23,19 +23,22 @@ MARGIN_S = 0.5
 """By how much a pose may be older than its kind is by nature, unless the caller says otherwise."""
 
 INTERPOLATED_AGE_S = 3.0  # radio and the next measurement of each prism, with reserve
-SMOOTHED_AGE_S = 5.0  # the default lag, and poses that are sent some at a time
+DEFAULT_LAG_S = 3.0  # of a stream without the record ``setup``
+BATCH_S = 1.5  # final smoothed poses are sent some at a time
 
 QUEUE_RECORDS = 1000
 """Of each iterator; when it is full, the oldest record is lost and a :class:`Gap` tells of it."""
 
 
-def default_max_age_s(pose: Pose) -> float:
-    """Return the age in s from which a pose is stale, by its kind."""
+def default_max_age_s(pose: Pose, lag_s: float | None = None) -> float:
+    """Return the age in s from which a pose is stale, by its kind; ``lag_s``: of the set-up."""
     if pose.kind == "predicted":
         return MARGIN_S
     if pose.kind == "interpolated":
         return INTERPOLATED_AGE_S
-    return SMOOTHED_AGE_S if pose.delay_s is None else pose.delay_s + MARGIN_S
+    if pose.delay_s is not None:
+        return pose.delay_s + MARGIN_S
+    return (DEFAULT_LAG_S if lag_s is None else lag_s) + BATCH_S + MARGIN_S
 
 
 class StreamBase:
@@ -59,6 +62,8 @@ class StreamBase:
         self._newest: dict[str, Pose] = {}
         self.hello: Hello | None = None
         """The greeting of the present session of the master; None before it."""
+        self.setup: Setup | None = None
+        """The set-up in force; None before it."""
         self.status: Status | None = None
         """The newest status; None before the first one."""
         self.stale_poses = 0
@@ -78,6 +83,8 @@ class StreamBase:
             elif isinstance(record, Hello):
                 self.hello = record
                 self._newest.clear()
+            elif isinstance(record, Setup):
+                self.setup = record
             elif isinstance(record, Status):
                 self.status = record
             elif isinstance(record, Gap):
@@ -110,7 +117,8 @@ class StreamBase:
         return not self._stale(pose, max_age_s) and (pose.valid or include_invalid)
 
     def _stale(self, pose: Pose, max_age_s: float | None) -> bool:
-        limit_s = default_max_age_s(pose) if max_age_s is None else max_age_s
+        lag_s = None if self.setup is None else self.setup.lag_s
+        limit_s = default_max_age_s(pose, lag_s) if max_age_s is None else max_age_s
         return pose.age_s(self._now_ns()) > limit_s
 
     @contextmanager

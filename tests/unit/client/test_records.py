@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness.records import EVENT, HELLO, IMU_STATUS, NO_POSE, POSE, STATUS
+from harness.records import EVENT, HELLO, IMU_STATUS, NO_POSE, POSE, SETUP, STATUS
 
 from tsgt.client import PROTOCOL_VERSION, Pose, records
+from tsgt.client.build import TYPES, build, load
 from tsgt.errors import StreamError
 from tsgt.recording import PROTOCOL_VERSION as MASTERS_VERSION
 from tsgt.recording import encode_line
@@ -29,6 +30,13 @@ CLASSES = {
     "StationStatus": records.StationStatus,
     "ImuStatus": records.ImuStatus,
     "EventRecord": records.Event,
+    "SetupRecord": records.Setup,
+    "SetupStation": records.SetupStation,
+    "SetupPrism": records.SetupPrism,
+    "SetupGeofence": records.SetupGeofence,
+    "ReferencePoint": records.ReferencePoint,
+    "RecordingStatus": records.RecordingStatus,
+    "DiskStatus": records.DiskStatus,
 }
 OURS = {"epoch_ns"}
 
@@ -71,11 +79,13 @@ def _annotation(text: str) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("record", [POSE, NO_POSE, HELLO, STATUS, replace(STATUS, imu=IMU_STATUS), EVENT])
+@pytest.mark.parametrize(
+    "record", [POSE, NO_POSE, HELLO, SETUP, STATUS, replace(STATUS, imu=IMU_STATUS), EVENT]
+)
 def test_every_value_arrives(record: Any) -> None:
     """What the master encodes is what the client's record has, to the last bit."""
-    data = records.load(encode_line(record))
-    built = records.build(records.TYPES[data["type"]], data)
+    data = load(encode_line(record))
+    built = build(TYPES[data["type"]], data)
     for field in fields(built):
         if field.name not in OURS:
             _same(getattr(built, field.name), getattr(record, field.name))
@@ -94,8 +104,8 @@ def _same(built: Any, sent: Any) -> None:
 
 def test_unknown_keys_are_ignored() -> None:
     """A later version may add some."""
-    data = records.load(encode_line(EVENT)) | {"colour": "red"}
-    assert records.build(records.Event, data).message == EVENT.message
+    data = load(encode_line(EVENT)) | {"colour": "red"}
+    assert build(records.Event, data).message == EVENT.message
 
 
 @pytest.mark.parametrize(
@@ -112,9 +122,9 @@ def test_unknown_keys_are_ignored() -> None:
 )
 def test_wrong_fields_are_rejected(change: dict[str, Any]) -> None:
     """They never become a pose."""
-    data = records.load(encode_line(POSE)) | change
+    data = load(encode_line(POSE)) | change
     with pytest.raises(StreamError):
-        records.build(Pose, data)
+        build(Pose, data)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +133,7 @@ def test_wrong_fields_are_rejected(change: dict[str, Any]) -> None:
 def test_other_lines_are_rejected(line: bytes) -> None:
     """Whatever is no JSON object with a type."""
     with pytest.raises(StreamError):
-        records.load(line)
+        load(line)
 
 
 def test_protocol_is_the_masters() -> None:

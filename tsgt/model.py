@@ -572,6 +572,54 @@ class ImuSamples:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryParameters(FiniteNumbers):
+    """Parameters that put the wheel odometry of the robot beside the samples of its IMU; sigmas are one sigma."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    """Point of the robot whose speed the wheels tell, in the frame ``robot``, [x, y, z] in m: the centre of the axle that does not
+    steer; of tracks, the middle between them."""
+    orientation_xyzw: Row4 = (0.0, 0.0, 0.0, 1.0)
+    """Rotation that takes coordinates in the axes of the wheels (x forwards, y to the left, z up) to the frame ``robot``, as
+    a Hamilton unit quaternion [x, y, z, w]."""
+    latency_ns: int = 0
+    """From a sample to its stamp, in ns; subtracted from the stamp. Positive: the stamp is late."""
+    speed_noise_mps: float = 0.01
+    """White noise of the speed of a sample, in m/s."""
+    scale_sigma: float = 0.02
+    """Relative error of the speed that stays: load, tyres, a wrong radius."""
+    slip_sigma: float = 0.03
+    """Relative error of the speed that comes and goes."""
+    slip_correlation_time_s: float = 5.0
+    """How long slip lasts, in s."""
+    direction_sigma_rad: float = 0.02
+    """Of the direction in which the robot goes straight ahead, about the z axis of the wheels, in rad."""
+    lateral_sigma_mps: float = 0.02
+    """Of the mean velocity across the wheels over a second, in m/s."""
+    vertical_sigma_mps: float = 0.03
+    """Of the mean velocity of the point along the z axis of the wheels over a second, in m/s."""
+    turning_sigma_m: float = 0.05
+    """By how far the point may be off the one that does not slide across in a turn, in m; times the yaw rate it is a velocity."""
+
+    def __post_init__(self) -> None:
+        """Reject impossible parameters."""
+        _check_limits(
+            self,
+            latency_ns=(-(10**10), 10**10),
+            speed_noise_mps=(1e-6, 10),
+            scale_sigma=(1e-6, 0.5),
+            slip_sigma=(1e-6, 0.5),
+            slip_correlation_time_s=(0.1, 3600),
+            direction_sigma_rad=(1e-6, 0.5),
+            lateral_sigma_mps=(1e-6, 10),
+            vertical_sigma_mps=(1e-6, 10),
+            turning_sigma_m=(0, 10),
+        )
+        _check_coordinates("position_m", self.position_m)
+        if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < _ROTATION_TOLERANCE:
+            raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SetupCovariance(FiniteNumbers):
     """Joint covariance of the calibrated set-up, which all poses share: it does not average out over time."""
 

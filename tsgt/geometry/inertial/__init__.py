@@ -7,6 +7,7 @@ docs/explanation/imu.md derives the equations.
 from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
 from tsgt.geometry.inertial.fixed_lag import InertialFixedLagSmoother, WindowTrajectory
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
+from tsgt.geometry.inertial.odometry import Odometry, OdometrySamples
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
@@ -48,6 +49,8 @@ __all__ = [
     "InertialStates",
     "InertialTrajectory",
     "Mounting",
+    "Odometry",
+    "OdometrySamples",
     "Preintegrated",
     "WindowTrajectory",
     "anchor_at_end",

@@ -2,7 +2,7 @@
 
 Between neighbouring knots: the preintegrated motion and the random walks of the biases. Without an accelerometer the
 preintegrated rotation alone, and the motion prior for position, velocity and acceleration. At knots: measurements of the
-prisms, the same as without an IMU. docs/explanation/imu.md derives the Jacobians.
+prisms, the same as without an IMU. With wheel odometry the states have three more components. docs/explanation/imu.md derives the Jacobians.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tsgt.geometry.inertial.odometry import add_wheel_processes, linearise_odometry
 from tsgt.geometry.inertial.preintegration import Preintegrated, concatenate_preintegrated, preintegrate
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, Gravity, InertialStates
 from tsgt.geometry.rigid import (
@@ -32,13 +33,11 @@ from tsgt.geometry.trajectory.states import States
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tsgt.geometry.inertial.odometry import Odometry, OdometrySteps
     from tsgt.geometry.inertial.preintegration import ContiguousSamples
     from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
     from tsgt.model import ImuNoise, MotionPrior
 
-_EARLIER, _LATER = slice(0, 15), slice(15, 30)
-_TILT, _RESIDUAL = slice(30, 32), 32
-_COLUMNS = 33
 _FACTORS_PER_CHUNK = 256  # Stay in the cache
 
 
@@ -51,6 +50,7 @@ class InertialFactors:
     walk_information: FloatArray  # (K - 1, 2) of each bias: inverse variance of its change
     # Without an accelerometer: transition, (K - 1, 3, 3), and information by axis, (K - 1, 3, 3, 3), of the motion prior
     motion: tuple[FloatArray, FloatArray] | None = None
+    odometry: OdometrySteps | None = None
 
     def __len__(self) -> int:
         return len(self.preintegrated)
@@ -68,10 +68,19 @@ class InertialFactors:
         noise: ImuNoise,
         *,
         gyro_only: MotionPrior | None = None,
+        odometry: Odometry | None = None,
     ) -> InertialFactors:
-        """Preintegrate between the states' times, about their biases; ``gyro_only``: prior of the motion in place of forces."""
+        """Preintegrate between the states' times, about their biases; ``gyro_only``: prior of the motion in place of forces.
+
+        ``odometry``: where the states have wheels.
+        """
         return cls.between(
-            samples, states.select(slice(None, -1)), states.time_s[1:], noise, gyro_only=gyro_only
+            samples,
+            states.select(slice(None, -1)),
+            states.time_s[1:],
+            noise,
+            gyro_only=gyro_only,
+            odometry=odometry,
         )
 
     @classmethod
@@ -83,14 +92,23 @@ class InertialFactors:
         noise: ImuNoise,
         *,
         gyro_only: MotionPrior | None = None,
+        odometry: Odometry | None = None,
     ) -> InertialFactors:
         """Preintegrate from N states to N later times."""
         bias = np.zeros(3) if gyro_only else earlier.bias_or_acceleration
         found = preintegrate(samples, earlier.time_s, end_s, earlier.gyro_bias, bias)
         walks = np.array([noise.gyro_bias_walk, noise.accelerometer_bias_walk])
         walk_information = 1.0 / (walks**2 * found.duration_s[:, None])
+        driven = None
+        if odometry is not None:
+            driven = odometry.between(samples, earlier.time_s, end_s, earlier.gyro_bias)
         if gyro_only is None:
-            return cls(found, np.linalg.inv(np.linalg.cholesky(found.covariance)), walk_information)
+            return cls(
+                found,
+                np.linalg.inv(np.linalg.cholesky(found.covariance)),
+                walk_information,
+                odometry=driven,
+            )
         sigma = 1.0 / np.sqrt(found.covariance[:, 3, 3])
         time_s = gyro_only.acceleration_correlation_time_s
         weights = np.array(gyro_only.acceleration_sigma_mps2) ** -2.0
@@ -103,6 +121,7 @@ class InertialFactors:
                 transition(found.duration_s, time_s),
                 information[:, None] * weights[:, None, None],
             ),
+            driven,
         )
 
     def select(self, rows: slice | NDArray[np.intp]) -> InertialFactors:
@@ -112,6 +131,7 @@ class InertialFactors:
             self.whitening[rows],
             self.walk_information[rows],
             None if self.motion is None else (self.motion[0][rows], self.motion[1][rows]),
+            None if self.odometry is None else self.odometry.select(rows),
         )
 
     def joined(self, others: InertialFactors) -> InertialFactors:
@@ -127,23 +147,26 @@ class InertialFactors:
             np.concatenate([self.whitening, others.whitening]),
             np.concatenate([self.walk_information, others.walk_information]),
             motion,
+            None
+            if self.odometry is None or others.odometry is None
+            else self.odometry.joined(others.odometry),
         )
 
 
 class InertialEquations(NamedTuple):
     """Normal equations of K states and of the tilt of gravity, which borders them."""
 
-    diagonal: FloatArray  # (K, 15, 15)
-    off_diagonal: FloatArray  # (K - 1, 15, 15)
-    gradient: FloatArray  # (K, 15)
-    border: FloatArray  # (K, 15, 2) of states and tilt
+    diagonal: FloatArray  # (K, D, D)
+    off_diagonal: FloatArray  # (K - 1, D, D)
+    gradient: FloatArray  # (K, D)
+    border: FloatArray  # (K, D, 2) of states and tilt
     corner: FloatArray  # (2, 2)
     corner_gradient: FloatArray  # (2,)
     cost: float  # Minus twice the log posterior density, up to a constant
     squared_distances: FloatArray  # (M,) squared Mahalanobis distance of each measurement's residual
     weights: FloatArray  # (M,) of the robust loss
     linearised: LinearisedMeasurements
-    whitened: FloatArray  # (M, 3, 16) Jacobians and residuals of measurements, without the robust weights
+    whitened: FloatArray  # (M, 3, D + 1) Jacobians and residuals of measurements, without the robust weights
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +175,8 @@ class InertialAnchor:
 
     linearisation_point: InertialStates  # One knot about which the error is counted
     tilt: FloatArray  # (2,) likewise
-    information: FloatArray  # (17, 17) inverse covariance of the errors
-    mean: FloatArray  # (17,) of the errors
+    information: FloatArray  # (D + 2, D + 2) inverse covariance of the errors
+    mean: FloatArray  # (D + 2,) of the errors
 
 
 def assemble_inertial(
@@ -173,47 +196,57 @@ def assemble_inertial(
     The layout of ``observations`` is from the IMU's origin in its axes. ``kinematics``: angular rate and specific force at
     the knots, (K, 3) each, biases included. ``active`` and ``rejectable``: as without an IMU.
     """
-    count = len(knots)
+    count, size = len(knots), knots.dim
+    earlier_part, later_part = slice(0, size), slice(size, 2 * size)
+    tilt_part, residual = slice(2 * size, 2 * size + TILT_DIM), 2 * size + TILT_DIM
     linearised = linearise(observations, _as_states(knots, kinematics, gravity, factors), knot_index)
-    whitened = by_inertial_states(linearised.whitened(observations), gyro_only=not factors.with_accelerometer)
-    squared_distances = dot(whitened[:, :, 15], whitened[:, :, 15])
+    whitened = by_inertial_states(
+        linearised.whitened(observations), gyro_only=not factors.with_accelerometer, dim=size
+    )
+    squared_distances = dot(whitened[:, :, size], whitened[:, :, size])
     weights, loss = robust_loss(squared_distances, active=active, rejectable=rejectable)
-    diagonal = np.zeros((count, INERTIAL_STATE_DIM, INERTIAL_STATE_DIM))
-    off_diagonal = np.zeros((count - 1, INERTIAL_STATE_DIM, INERTIAL_STATE_DIM))
-    gradient, border = np.zeros((count, INERTIAL_STATE_DIM)), np.zeros((count, INERTIAL_STATE_DIM, TILT_DIM))
+    diagonal = np.zeros((count, size, size))
+    off_diagonal = np.zeros((count - 1, size, size))
+    gradient, border = np.zeros((count, size)), np.zeros((count, size, TILT_DIM))
     corner, corner_gradient = np.zeros((TILT_DIM, TILT_DIM)), np.zeros(TILT_DIM)
     add_measurements(whitened, weights, knot_index, diagonal, gradient)
     cost = float(loss.sum())
     for start in range(0, count - 1, _FACTORS_PER_CHUNK):
         chunk = slice(start, min(start + _FACTORS_PER_CHUNK, count - 1))
         later = slice(chunk.start + 1, chunk.stop + 1)
-        rows = linearise_inertial(
-            knots.select(slice(chunk.start, later.stop)), gravity, factors.select(chunk)
-        )
+        some, steps = knots.select(slice(chunk.start, later.stop)), factors.select(chunk)
+        rows = linearise_inertial(some, gravity, steps)
         normal = np.swapaxes(rows, 1, 2) @ rows
-        diagonal[chunk] += normal[:, _EARLIER, _EARLIER]
-        diagonal[later] += normal[:, _LATER, _LATER]
-        off_diagonal[chunk] += normal[:, _EARLIER, _LATER]
-        gradient[chunk] += normal[:, _EARLIER, _RESIDUAL]
-        gradient[later] += normal[:, _LATER, _RESIDUAL]
-        border[chunk] += normal[:, _EARLIER, _TILT]
-        border[later] += normal[:, _LATER, _TILT]
-        corner += normal[:, _TILT, _TILT].sum(axis=0)
-        corner_gradient += normal[:, _TILT, _RESIDUAL].sum(axis=0)
-        cost += float(normal[:, _RESIDUAL, _RESIDUAL].sum())
+        cost += float(normal[:, residual, residual].sum())
+        if steps.odometry is not None:
+            rows = linearise_odometry(some, steps.odometry)
+            odometry_weights, odometry_loss = robust_loss(dot(rows[:, :, residual], rows[:, :, residual]))
+            normal += np.swapaxes(rows * odometry_weights[:, None, None], 1, 2) @ rows
+            cost += float(odometry_loss.sum())
+        diagonal[chunk] += normal[:, earlier_part, earlier_part]
+        diagonal[later] += normal[:, later_part, later_part]
+        off_diagonal[chunk] += normal[:, earlier_part, later_part]
+        gradient[chunk] += normal[:, earlier_part, residual]
+        gradient[later] += normal[:, later_part, residual]
+        border[chunk] += normal[:, earlier_part, tilt_part]
+        border[later] += normal[:, later_part, tilt_part]
+        corner += normal[:, tilt_part, tilt_part].sum(axis=0)
+        corner_gradient += normal[:, tilt_part, residual].sum(axis=0)
     cost += _add_walks(knots, factors, diagonal, off_diagonal, gradient)
+    if factors.odometry is not None:
+        cost += add_wheel_processes(knots.wheels, factors.odometry, diagonal, off_diagonal, gradient)
 
     first = knots.select(slice(0, 1)).local_coordinates_about(anchor.linearisation_point)[0]
-    by_error = np.eye(INERTIAL_STATE_DIM + TILT_DIM)
+    by_error = np.eye(size + TILT_DIM)
     by_error[3:6, 3:6] = inverse_right_jacobian(first[3:6])
     error = np.concatenate([first, gravity.tilt - anchor.tilt]) - anchor.mean
     weighted = by_error.T @ anchor.information
     information, by_anchor = weighted @ by_error, weighted @ error
-    diagonal[0] += information[:15, :15]
-    gradient[0] += by_anchor[:15]
-    border[0] += information[:15, 15:]
-    corner += information[15:, 15:]
-    corner_gradient += by_anchor[15:]
+    diagonal[0] += information[:size, :size]
+    gradient[0] += by_anchor[:size]
+    border[0] += information[:size, size:]
+    corner += information[size:, size:]
+    corner_gradient += by_anchor[size:]
     cost += float(error @ anchor.information @ error)
     return InertialEquations(
         diagonal,
@@ -231,10 +264,12 @@ def assemble_inertial(
 
 
 def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: InertialFactors) -> FloatArray:
-    """Whitened rows of the K - 1 factors between knots, (K - 1, R, 33), but for the walks of the biases.
+    """Whitened rows of the K - 1 factors between knots, (K - 1, R, 2 D + 3), but for the walks of the biases.
 
-    Columns: the errors of the earlier state, 15, of the later one, 15, of the tilt, 2, and the residual.
+    Columns: the errors of the earlier state, D, of the later one, D, of the tilt, 2, and the residual. D is 15 without wheel odometry.
     """
+    size = knots.dim
+    tilt_part, column = slice(2 * size, 2 * size + TILT_DIM), 2 * size + TILT_DIM
     found = factors.preintegrated
     gyro_only = not factors.with_accelerometer
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
@@ -244,13 +279,13 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     turned = R_T @ later.rotation
     residual = fast_log_so3(np.swapaxes(rotation, 1, 2) @ turned)
     J_r_inv = inverse_right_jacobian(residual)
-    by_rotation = np.zeros((len(found), 3, _COLUMNS))
+    by_rotation = np.zeros((len(found), 3, column + 1))
     by_rotation[:, :, 3:6] = -J_r_inv @ np.swapaxes(turned, 1, 2)
     # The correction by the bias is applied to the preintegrated rotation on its right.
     correction = exp_so3(-residual)
     by_rotation[:, :, 9:12] = -J_r_inv @ correction @ found.by_gyro_bias[:, 3:6]
-    by_rotation[:, :, 18:21] = J_r_inv
-    by_rotation[:, :, _RESIDUAL] = residual
+    by_rotation[:, :, size + 3 : size + 6] = J_r_inv
+    by_rotation[:, :, column] = residual
     if gyro_only:
         whitened = factors.whitening @ by_rotation
         return np.concatenate([whitened, _motion_rows(earlier, later, factors)], axis=1)
@@ -261,17 +296,17 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     )
     gained = matvec(R_T, later.velocity - earlier.velocity - duration_s * fall)
     by_tilt = R_T @ gravity.by_tilt()
-    rows = np.zeros((len(found), 9, _COLUMNS))
+    rows = np.zeros((len(found), 9, column + 1))
     rows[:, 3:6] = by_rotation
-    rows[:, 0:3, 0:3], rows[:, 0:3, 15:18] = -R_T, R_T
+    rows[:, 0:3, 0:3], rows[:, 0:3, size : size + 3] = -R_T, R_T
     rows[:, 0:3, 3:6] = skew(moved)
     rows[:, 0:3, 6:9] = -duration_s[..., None] * R_T
-    rows[:, 0:3, _TILT] = -0.5 * duration_s[..., None] ** 2 * by_tilt
-    rows[:, 0:3, _RESIDUAL] = moved - position
+    rows[:, 0:3, tilt_part] = -0.5 * duration_s[..., None] ** 2 * by_tilt
+    rows[:, 0:3, column] = moved - position
     rows[:, 6:9, 3:6] = skew(gained)
-    rows[:, 6:9, 6:9], rows[:, 6:9, 21:24] = -R_T, R_T
-    rows[:, 6:9, _TILT] = -duration_s[..., None] * by_tilt
-    rows[:, 6:9, _RESIDUAL] = gained - velocity
+    rows[:, 6:9, 6:9], rows[:, 6:9, size + 6 : size + 9] = -R_T, R_T
+    rows[:, 6:9, tilt_part] = -duration_s[..., None] * by_tilt
+    rows[:, 6:9, column] = gained - velocity
     for part in (slice(0, 3), slice(6, 9)):
         rows[:, part, 9:12] = -found.by_gyro_bias[:, part]
         rows[:, part, 12:15] = -found.by_accelerometer_bias[:, part]
@@ -280,15 +315,16 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
 
 
 def _motion_rows(earlier: InertialStates, later: InertialStates, factors: InertialFactors) -> FloatArray:
-    """(K - 1, 9, 33) whitened rows of the motion prior on position, velocity and acceleration, axis by axis."""
+    """(K - 1, 9, 2 D + 3) whitened rows of the motion prior on position, velocity and acceleration, axis by axis."""
     assert factors.motion is not None  # noqa: S101 (only called without an accelerometer)
     phi, information = factors.motion
     roots = np.swapaxes(np.linalg.cholesky(information), 2, 3)
-    rows = np.zeros((len(phi), 9, _COLUMNS))
+    size = earlier.dim
+    rows = np.zeros((len(phi), 9, 2 * size + TILT_DIM + 1))
     for axis in range(3):
         own = rows[:, 3 * axis : 3 * axis + 3]
         columns = np.array([axis, 6 + axis, 12 + axis])
-        own[:, :, columns], own[:, :, 15 + columns] = -roots[:, axis] @ phi, roots[:, axis]
+        own[:, :, columns], own[:, :, size + columns] = -roots[:, axis] @ phi, roots[:, axis]
         before, after = (
             np.stack(
                 [each.position[:, axis], each.velocity[:, axis], each.bias_or_acceleration[:, axis]], axis=1
@@ -298,7 +334,7 @@ def _motion_rows(earlier: InertialStates, later: InertialStates, factors: Inerti
         # Counted from the earlier position, which keeps the digits of short steps.
         after[:, 0] -= before[:, 0]
         before[:, 0] = 0.0
-        own[:, :, _RESIDUAL] = matvec(roots[:, axis], after - matvec(phi, before))
+        own[:, :, -1] = matvec(roots[:, axis], after - matvec(phi, before))
     return rows
 
 
@@ -350,18 +386,18 @@ def _as_states(
     )
 
 
-def by_inertial_states(rows: FloatArray, *, gyro_only: bool) -> FloatArray:
-    """Rows of measurements by the 18 components of a state without IMU, (M, 3, 19), as rows by those with, (M, 3, 16).
+def by_inertial_states(rows: FloatArray, *, gyro_only: bool, dim: int = INERTIAL_STATE_DIM) -> FloatArray:
+    """Rows of measurements by the 18 components of a state without IMU, (M, 3, 19), as rows by those with, (M, 3, D + 1).
 
     The last column of both is the residual.
 
     The acceleration acts over the time from the knot to the measurement, at most 10 ms, over which neither the bias of the
     accelerometer nor the rotation changes it by what could be measured.
     """
-    inertial = np.zeros((*rows.shape[:2], INERTIAL_STATE_DIM + 1))
+    inertial = np.zeros((*rows.shape[:2], dim + 1))
     inertial[:, :, 0:9] = rows[:, :, 0:9]
     inertial[:, :, 9:12] = -rows[:, :, 9:12]
     if gyro_only:
         inertial[:, :, 12:15] = rows[:, :, 12:15]
-    inertial[:, :, 15] = rows[:, :, 18]
+    inertial[:, :, dim] = rows[:, :, 18]
     return inertial

@@ -122,6 +122,7 @@ def states_on_tracks(
         velocity,
         np.broadcast_to(gyro_bias, position.shape).copy(),
         np.zeros_like(position),
+        np.empty((len(time_s), 0)),
     )
 
 

@@ -35,7 +35,7 @@ class Linearised(NamedTuple):
     weights: FloatArray
     knot_index: NDArray[np.intp]
     anchor: InertialAnchor | None = None  # That depends on the set-up
-    anchor_displacement: FloatArray | None = None  # (17, r) of its mean
+    anchor_displacement: FloatArray | None = None  # (D + 2, r) of its mean
 
 
 class InertialSensitivity:
@@ -45,25 +45,28 @@ class InertialSensitivity:
         self._by_setup, self._mounting, self._gyro_only = setup_jacobian, mounting, gyro_only
 
     def displacement(self, solved: Linearised, factor: BorderedCholesky) -> tuple[FloatArray, FloatArray]:
-        """(K, 15, r) displacement of K knots, and (2, r) of the tilt."""
+        """(K, D, r) displacement of K knots, and (2, r) of the tilt."""
         observations, linearised, weights, knot_index, anchor, anchor_displacement = solved
         # Prisms are uncertain along the axes of the robot.
         of_robot = replace(linearised, rotation=linearised.rotation @ self._mounting.rotation.T)
         by_setup = self._by_setup(observations, of_robot)
         jacobian = _jacobian(linearised, gyro_only=self._gyro_only)
         information = np.linalg.inv(linearised.covariance(observations)) * weights[:, None, None]
-        mixed = np.zeros((len(factor.border), INERTIAL_STATE_DIM, by_setup.shape[2]))
-        np.add.at(mixed, knot_index, np.swapaxes(jacobian, 1, 2) @ (information @ by_setup))
+        size = factor.border.shape[1]
+        mixed = np.zeros((len(factor.border), size, by_setup.shape[2]))
+        np.add.at(
+            mixed[:, :INERTIAL_STATE_DIM], knot_index, np.swapaxes(jacobian, 1, 2) @ (information @ by_setup)
+        )
         shared = np.zeros((TILT_DIM, by_setup.shape[2]))
         if anchor is not None and anchor_displacement is not None:
             by_anchor = anchor.information @ anchor_displacement
-            mixed[0] -= by_anchor[:INERTIAL_STATE_DIM]
-            shared -= by_anchor[INERTIAL_STATE_DIM:]
+            mixed[0] -= by_anchor[:size]
+            shared -= by_anchor[size:]
         displaced, shared_displaced = factor.solve(mixed, shared)
         return -displaced, -shared_displaced
 
     def at_last(self, solved: Linearised, factor: BorderedCholesky) -> FloatArray:
-        """(17, r) displacement of the last knot and the tilt: that of the anchor prior on it."""
+        """(D + 2, r) displacement of the last knot and the tilt: that of the anchor prior on it."""
         states, shared = self.displacement(solved, factor)
         return np.concatenate([states[-1], shared])
 

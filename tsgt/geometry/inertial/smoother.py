@@ -14,22 +14,30 @@ import numpy as np
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading, states_on_tracks
+from tsgt.geometry.inertial.odometry import Odometry
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory
 from tsgt.geometry.inertial.sensitivity import residual_variances, setup_displacement
 from tsgt.geometry.inertial.solver import InertialSetup, inertial_knot_times, solve_inertial
-from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting, concatenate_inertial_states
+from tsgt.geometry.inertial.states import (
+    INERTIAL_STATE_DIM,
+    Gravity,
+    InertialStates,
+    Mounting,
+    concatenate_inertial_states,
+)
 from tsgt.geometry.trajectory import nearest_knots
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.geometry.inertial.initialisation import HeadingSearch
+    from tsgt.geometry.inertial.odometry import OdometrySamples
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.inertial.solver import InertialSolution
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory import Observations, SetupJacobian
-    from tsgt.model import ImuNoise, ImuParameters, MotionPrior
+    from tsgt.model import ImuNoise, ImuParameters, MotionPrior, OdometryParameters
 
 SEGMENT_S = 240.0  # Over which the gyro turns by a few degrees more than it says
 OVERLAP_S = 40.0  # On either side of a segment, solved with it and discarded
@@ -87,6 +95,7 @@ def fit_inertial_trajectory(
     *,
     reference_m: FloatArray,
     gyro_only: MotionPrior | None = None,
+    odometry: tuple[OdometrySamples, OdometryParameters] | None = None,
     setup_jacobian: SetupJacobian | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> InertialFit:
@@ -100,6 +109,7 @@ def fit_inertial_trajectory(
         missing.
     reference_m : Origin of that layout, (3,) in the robot frame: the point whose poses the trajectory gives.
     gyro_only : Do not use the specific forces but this prior of the motion.
+    odometry : Samples of the wheel odometry, and how they are used.
     setup_jacobian : Sensitivity to the set-up's errors, for the part of the covariance that all states share.
     on_progress : Called with the completed share of the work, 0 to 1.
     """
@@ -112,6 +122,7 @@ def fit_inertial_trajectory(
     setup = InertialSetup(
         contiguous(samples, noise, start_s=float(time_s[0]), end_s=float(time_s[-1])), noise, gyro_only
     )
+    wheels = None if odometry is None else Odometry.of(*odometry, of_states, reference_m)
     near, gravity = find_start(mounted, setup, Gravity.of(imu))
     count = max(round(float(time_s[-1] - time_s[0]) / SEGMENT_S), 1)
     edges_s = np.linspace(time_s[0], time_s[-1], count + 1)
@@ -125,7 +136,9 @@ def fit_inertial_trajectory(
         rows = slice(*np.searchsorted(knot_index, (solved.start, solved.stop)))
         some = mounted.select(rows)
         guess = extended(near, time_s[solved], some, setup)
-        return solve_inertial(some, setup, guess, gravity), some, solved.start
+        if wheels is not None:
+            guess = guess.with_wheels()
+        return solve_inertial(some, replace(setup, odometry=wheels), guess, gravity), some, solved.start
 
     first = int(np.clip(np.searchsorted(edges_s, near.time_s[0], side="right") - 1, 0, count - 1))
     while (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
@@ -192,11 +205,12 @@ class _Part:
         setup_jacobian: SetupJacobian | None,
     ) -> _Part:
         """Return the knots ``kept`` and their measurements."""
-        covariance, cross_covariance = solution.factor.marginals()
+        motion = slice(INERTIAL_STATE_DIM)
+        covariance, cross_covariance = (each[:, motion, motion] for each in solution.factor.marginals())
         rows = slice(*np.searchsorted(solution.knot_index, (kept.start, kept.stop)))
         displacement = None
         if setup_jacobian is not None:
-            displacement = setup_displacement(solution, observations, mounting, setup_jacobian)[kept]
+            displacement = setup_displacement(solution, observations, mounting, setup_jacobian)[kept, motion]
         return cls(
             solution.knots.select(kept),
             covariance[kept],

@@ -19,7 +19,7 @@ from tsgt.geometry.inertial.factors import (
     InertialFactors,
     assemble_inertial,
 )
-from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, Gravity, InertialStates
+from tsgt.geometry.inertial.states import TILT_DIM, Gravity, InertialStates
 from tsgt.geometry.rigid import dot
 from tsgt.geometry.trajectory.gauss_newton import (
     COARSE_NOISE_SCALES,
@@ -39,6 +39,7 @@ from tsgt.geometry.trajectory.gauss_newton import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tsgt.geometry.inertial.odometry import Odometry
     from tsgt.geometry.inertial.preintegration import ContiguousSamples
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
@@ -62,6 +63,13 @@ class InertialSetup:
     gyro_only: MotionPrior | None = (
         None  # Prior of the motion of the states' origin, in place of specific forces
     )
+    odometry: Odometry | None = None  # With states that have wheels
+
+    def factors(self, knots: InertialStates) -> InertialFactors:
+        """Return the factors between knots."""
+        return InertialFactors.of(
+            self.samples, knots, self.noise, gyro_only=self.gyro_only, odometry=self.odometry
+        )
 
 
 class InertialSolution(NamedTuple):
@@ -98,7 +106,11 @@ def inertial_knot_times(
 
 
 def diffuse_inertial_prior(
-    first: InertialStates, gravity: Gravity, noise: ImuNoise, gyro_only: MotionPrior | None = None
+    first: InertialStates,
+    gravity: Gravity,
+    noise: ImuNoise,
+    gyro_only: MotionPrior | None = None,
+    odometry: Odometry | None = None,
 ) -> InertialAnchor:
     """Prior on the first knot that carries next to no information, but for the biases, and on the tilt."""
     of_last = (
@@ -111,11 +123,18 @@ def diffuse_inertial_prior(
             np.full(3, INITIAL_VELOCITY_SIGMA_MPS),
             np.full(3, noise.gyro_bias_radps),
             of_last,
+            np.empty(0) if odometry is None else odometry.prior_sigmas(),
             np.full(TILT_DIM, max(gravity.tilt_sigma_rad, 1e-9)),
         ]
     )
     zero = np.zeros((1, 3))
-    about = replace(first, velocity=zero, gyro_bias=zero, bias_or_acceleration=zero)
+    about = replace(
+        first,
+        velocity=zero,
+        gyro_bias=zero,
+        bias_or_acceleration=zero,
+        wheels=np.zeros_like(first.wheels),
+    )
     return InertialAnchor(about, np.zeros(TILT_DIM), np.diag(sigmas**-2.0), np.zeros(len(sigmas)))
 
 
@@ -146,9 +165,11 @@ def solve_inertial(
     determine the trajectory.
     """
     if anchor is None:
-        anchor = diffuse_inertial_prior(guess.select(slice(0, 1)), gravity, setup.noise, setup.gyro_only)
+        anchor = diffuse_inertial_prior(
+            guess.select(slice(0, 1)), gravity, setup.noise, setup.gyro_only, setup.odometry
+        )
     if factors is None:
-        factors = InertialFactors.of(setup.samples, guess, setup.noise, gyro_only=setup.gyro_only)
+        factors = setup.factors(guess)
     knot_index = nearest_knots(guess.time_s, observations.time_s)
     search = _Search(observations, knot_index, setup, anchor, setup.samples.at(guess.time_s))
     found = search.minimise(guess, gravity, factors, max_iterations)
@@ -241,7 +262,7 @@ class _Search:
         moved = knots.gyro_bias[:-1] - found.gyro_bias
         if not (np.sqrt(dot(moved, moved)) * found.duration_s > MAX_BIAS_ROTATION_RAD).any():
             return factors
-        return InertialFactors.of(self.setup.samples, knots, self.setup.noise, gyro_only=self.setup.gyro_only)
+        return self.setup.factors(knots)
 
 
 def _factorise(system: InertialEquations) -> BorderedCholesky:
@@ -252,7 +273,7 @@ def apply_linear_step(
     system: InertialEquations, knot_index: NDArray[np.intp], step: FloatArray, gain: float
 ) -> InertialEquations:
     """Apply a small step to residuals, weights and cost; Jacobians stay those before the step."""
-    size = INERTIAL_STATE_DIM
+    size = system.whitened.shape[2] - 1
     residuals = (
         system.whitened[:, :, size] + (system.whitened[:, :, :size] @ step[knot_index][:, :, None])[:, :, 0]
     )

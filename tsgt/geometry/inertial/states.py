@@ -2,12 +2,13 @@
 
 The error (local coordinates) of a state has 15 components, three each of: position of the IMU's origin (frame ``station1``),
 rotation (about its own axes, ``R Exp(d)``), velocity (``station1``), bias of the gyro (its axes), and bias of the accelerometer
-(its axes), or without an accelerometer the acceleration (``station1``).
+(its axes), or without an accelerometer the acceleration (``station1``). With wheel odometry three more follow: its scale, its
+slip, and the direction of travel.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from tsgt.model import ImuParameters
 
 INERTIAL_STATE_DIM = 15  # Components of a state's error
+WHEELS_DIM = 3  # Further components with wheel odometry
 TILT_DIM = 2
 
 
@@ -41,16 +43,27 @@ class InertialStates:
     gyro_bias: FloatArray  # (K, 3) in the axes of the IMU, rad/s
     # (K, 3) in the axes of the IMU, m/s^2; with the gyro alone: acceleration in frame ``station1``, m/s^2
     bias_or_acceleration: FloatArray
+    # (K, 3): scale and slip of the wheel odometry, which add to 1, and direction of travel, rad, positive to the left; (K, 0) without
+    wheels: FloatArray
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @property
+    def dim(self) -> int:
+        """Components of a state's error."""
+        return INERTIAL_STATE_DIM + int(self.wheels.shape[1])
 
     def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> InertialStates:
         """Return the states of some rows."""
         return InertialStates(*(getattr(self, each.name)[rows] for each in fields(self)))
 
+    def with_wheels(self) -> InertialStates:
+        """Return the states with wheel odometry that is exact."""
+        return replace(self, wheels=np.zeros((len(self), WHEELS_DIM)))
+
     def retract(self, error: FloatArray) -> InertialStates:
-        """Add errors, (K, 15), to the states."""
+        """Add errors, (K, D), to the states."""
         return InertialStates(
             self.time_s,
             self.position + error[:, 0:3],
@@ -58,10 +71,11 @@ class InertialStates:
             self.velocity + error[:, 6:9],
             self.gyro_bias + error[:, 9:12],
             self.bias_or_acceleration + error[:, 12:15],
+            self.wheels + error[:, 15:],
         )
 
     def local_coordinates_about(self, other: InertialStates) -> FloatArray:
-        """Return the errors d, (K, 15), of these states about others: ``other.retract(d)`` gives these states."""
+        """Return the errors d, (K, D), of these states about others: ``other.retract(d)`` gives these states."""
         return np.concatenate(
             [
                 self.position - other.position,
@@ -69,6 +83,7 @@ class InertialStates:
                 self.velocity - other.velocity,
                 self.gyro_bias - other.gyro_bias,
                 self.bias_or_acceleration - other.bias_or_acceleration,
+                self.wheels - other.wheels,
             ],
             axis=1,
         )

@@ -151,6 +151,7 @@ def _moved(solution: JointSolution, times_s: FloatArray, latency_s: float) -> In
         states.velocity + acceleration * delta_s,
         states.gyro_bias,
         states.bias_or_acceleration,
+        states.wheels,
     )
 
 
@@ -180,4 +181,5 @@ def states_of_imu(
         + matvec(rotation, cross(states.angular_velocity, mounting.position)),
         np.tile(gyro_bias, (len(stamps_s), 1)),
         np.zeros_like(arm),
+        np.empty((len(stamps_s), 0)),
     )

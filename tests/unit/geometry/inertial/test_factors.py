@@ -48,6 +48,7 @@ def example(rng: np.random.Generator) -> tuple[ContiguousSamples, InertialStates
         rng.normal(size=(COUNT, 3)),
         rng.normal(scale=1e-4, size=(COUNT, 3)),
         rng.normal(scale=1e-2, size=(COUNT, 3)),
+        np.empty((COUNT, 0)),
     )
     return (
         contiguous(samples, NOISE),

@@ -53,6 +53,7 @@ def example() -> Example:
         rng.normal(size=(count, 3)),
         rng.normal(scale=1e-3, size=(count, 3)),
         rng.normal(scale=1e-2, size=(count, 3)),
+        np.empty((count, 0)),
     )
     anchor = without_tilt(diffuse_inertial_prior(states.select(slice(0, 1)), drive.gravity, drive.imu.noise))
     prior = SetupPrior.wide(drive.truth, 0.01)

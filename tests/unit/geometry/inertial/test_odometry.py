@@ -1,0 +1,154 @@
+"""Wheel odometry between knots: Jacobians, displacement in a turn, gaps, slip."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from harness.inertial_drive import GRADES, imu_parameters, inertial_drive
+from scipy.spatial.transform import Rotation
+
+from tsgt.geometry.inertial import (
+    InertialSamples,
+    InertialStates,
+    Mounting,
+    contiguous,
+    fit_inertial_trajectory,
+)
+from tsgt.geometry.inertial.odometry import (
+    Odometry,
+    OdometrySamples,
+    OdometrySteps,
+    add_wheel_processes,
+    linearise_odometry,
+)
+from tsgt.model import OdometryParameters
+
+PARAMETERS = OdometryParameters(
+    position_m=(-0.3, 0.1, 0.05),
+    orientation_xyzw=(0.0, 0.0, 0.0998334, 0.9950042),
+)
+MOUNTING = Mounting(Rotation.from_euler("xyz", [0.1, -0.2, 1.0]).as_matrix(), np.array([0.2, 0.0, 0.5]))
+RATE_RADPS = 0.8
+
+
+def turning(end_s: float = 2.0) -> tuple[Odometry, InertialStates, InertialSamples]:
+    """Return exact odometry of a circle at 1.2 m/s, at 20 Hz, states of the IMU every 0.25 s, and its samples."""
+    step_s = np.arange(0.05, end_s + 1e-9, 0.05)
+    samples = OdometrySamples(step_s, np.full(len(step_s), 0.05), np.full(len(step_s), 1.2))
+    odometry = Odometry.of(samples, PARAMETERS, MOUNTING, np.zeros(3))
+    time_s = np.arange(0.0, end_s + 1e-9, 0.25)
+    yaw = RATE_RADPS * time_s
+    wheels = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    radius_m = 1.2 / RATE_RADPS
+    point = radius_m * np.stack([np.sin(yaw), 1.0 - np.cos(yaw), np.zeros_like(yaw)], axis=1)
+    rotation = wheels @ odometry.axes.T
+    zero = np.zeros((len(time_s), 3))
+    states = InertialStates(time_s, point - rotation @ odometry.arm_m, rotation, zero, zero, zero, zero)
+    imu_s = np.arange(0.005, end_s + 1e-9, 0.005)
+    rate = np.tile(odometry.axes @ [0.0, 0.0, RATE_RADPS], (len(imu_s), 1))
+    return odometry, states, InertialSamples(imu_s, np.full(len(imu_s), 0.005), rate, np.zeros_like(rate))
+
+
+def steps_of(odometry: Odometry, states: InertialStates, samples: InertialSamples) -> OdometrySteps:
+    """Return the steps between all states."""
+    present = contiguous(samples, GRADES["industrial"])
+    return odometry.between(present, states.time_s[:-1], states.time_s[1:], states.gyro_bias[:-1])
+
+
+def test_exact_odometry_in_a_turn_has_no_residual() -> None:
+    """The wheels' point, off the IMU and in other axes, moves along the arc."""
+    odometry, states, samples = turning()
+    rows = linearise_odometry(states, steps_of(odometry, states, samples))
+    # The chords of samples of 50 ms are shorter than the arc by 0.1 mm per metre.
+    assert np.abs(rows[:, :, -1]).max() < 0.05
+
+
+def test_rows_equal_differences() -> None:
+    """Jacobians by both states, by scale, slip and direction among them."""
+    odometry, states, samples = turning(0.5)
+    rng = np.random.default_rng(0)
+    states = states.retract(rng.normal(scale=0.05, size=(3, 18)))
+    steps = steps_of(odometry, states, samples)
+    rows = linearise_odometry(states, steps)
+    scale = np.abs(rows[:, :, :-1]).max()
+    h = 1e-6
+    for knot in range(3):
+        for column in range(18):
+            error = np.zeros((3, 18))
+            error[knot, column] = h
+            difference = (
+                linearise_odometry(states.retract(error), steps)[:, :, -1]
+                - linearise_odometry(states.retract(-error), steps)[:, :, -1]
+            ) / (2 * h)
+            for step in range(2):
+                own = knot - step in (0, 1)
+                expected = rows[step, :, 18 * (knot - step) + column] if own else np.zeros(3)
+                np.testing.assert_allclose(difference[step] / scale, expected / scale, atol=1e-7)
+    assert not rows[:, :, 36:38].any()
+
+
+def test_processes_equal_their_density() -> None:
+    """Cost and gradient are those of Gauss-Markov steps; the covariance of slip stays that of its prior."""
+    odometry, states, samples = turning(0.5)
+    steps = steps_of(odometry, states, samples)
+    wheels = np.random.default_rng(1).normal(scale=0.02, size=(3, 3))
+
+    def cost(values: np.ndarray) -> float:
+        return float(((values[1:] - steps.kept * values[:-1]) ** 2 / steps.variances).sum())
+
+    diagonal, off_diagonal, gradient = np.zeros((3, 18, 18)), np.zeros((2, 18, 18)), np.zeros((3, 18))
+    assert add_wheel_processes(wheels, steps, diagonal, off_diagonal, gradient) == pytest.approx(cost(wheels))
+    h = 1e-5
+    for knot in range(3):
+        for column in range(3):
+            moved = wheels.copy()
+            moved[knot, column] += h
+            back = wheels.copy()
+            back[knot, column] -= h
+            difference = (cost(moved) - cost(back)) / (4 * h)
+            assert gradient[knot, 15 + column] == pytest.approx(difference, rel=1e-5)
+    diagonal[0, 15:, 15:] += np.diag(odometry.prior_sigmas() ** -2.0)
+    slip = diagonal[:, 16, 16] * np.eye(3)
+    slip[[0, 1], [1, 2]] = slip[[1, 2], [0, 1]] = off_diagonal[:, 16, 16]
+    np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(slip))), PARAMETERS.slip_sigma, rtol=1e-9)
+
+
+def test_a_step_without_samples_says_nothing() -> None:
+    """Samples are missing from 0.4 to 0.6 s: the two steps that they leave mostly uncovered have no weight."""
+    odometry, states, samples = turning(1.0)
+    kept = (odometry.samples.end_s < 0.41) | (odometry.samples.end_s > 0.64)
+    steps = steps_of(replace(odometry, samples=odometry.samples.select(kept)), states, samples)
+    np.testing.assert_array_equal(steps.whitening.any(axis=(1, 2)), [True, False, False, True])
+    np.testing.assert_array_equal(linearise_odometry(states, steps)[1:3], 0.0)
+
+
+@pytest.mark.slow
+def test_outage_with_odometry() -> None:
+    """Fourteen seconds without measurements: wheels with 2 % of scale help although they spin for two seconds."""
+    imu = imu_parameters()
+    drive = inertial_drive(31.0, seed=12)
+    samples, observations = drive.samples(imu), drive.measure()
+    observations = observations.select((observations.time_s < 13.0) | (observations.time_s > 27.0))
+    step_s = np.arange(0.05, 31.0, 0.05)
+    position, rotation = drive.pose_at(step_s - 0.05)
+    moved = drive.pose_at(step_s)[0] - position
+    speed = 0.98 * np.einsum("nji,nj->ni", rotation, moved)[:, 0] / 0.05
+    speed[(step_s > 21.0) & (step_s < 23.0)] *= 1.3
+    wheels = OdometrySamples(step_s, np.full(len(step_s), 0.05), speed)
+    time_s = np.arange(14.0, 26.0, 0.1)
+    truth = drive.pose_at(time_s)[0]
+    errors = []
+    for odometry in (None, (wheels, OdometryParameters())):
+        found = fit_inertial_trajectory(
+            observations, samples, imu, reference_m=np.zeros(3), odometry=odometry
+        ).trajectory
+        states, covariance = found.at(time_s)
+        error = states.position - truth
+        errors.append(np.sqrt((error**2).sum(axis=1).mean()))
+        normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance[:, :3, :3]), error)
+        assert normalised.mean() < 6.0
+    assert errors[1] < 0.8 * errors[0]
+    # Of the true speed the measured one is 0.98 times.
+    assert found.knots.wheels[-1, :2].sum() == pytest.approx(1 / 0.98 - 1, abs=0.005)

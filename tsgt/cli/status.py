@@ -151,9 +151,9 @@ def imu_label(imu: ImuStatus) -> tuple[str, bool]:
         return "CHECK IT", False
     if imu.use == "wrong_setup":
         return "ITS SET-UP IS WRONG", False
-    if imu.use == "disagrees" or imu.disagreement:
+    if imu.use == "disagrees" or (imu.disagreement and imu.use != "unconfirmed"):
         return "DISAGREES WITH THE PRISMS", False
-    return ("NOT IN USE YET" if imu.use == "starting" else "OK"), True
+    return ("NOT IN USE YET" if imu.use in {"starting", "unconfirmed"} else "OK"), True
 
 
 def _imu_lines(imu: ImuStatus) -> list[str]:

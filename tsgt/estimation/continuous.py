@@ -30,10 +30,9 @@ from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
+    from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor
     from tsgt.estimation.imu_takeover import ImuState, TrajectoryWindow
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import States
@@ -49,11 +48,11 @@ _NONE = np.empty((0, _POSE_DIM, _POSE_DIM))
 class ContinuousEstimator:
     """The estimator ``continuous``, with the interface of :class:`~tsgt.estimation.linear.LinearEstimator`.
 
-    ``untrusted``: says why the IMU must not be used, None if nothing is known. ``outside_lag_window``: by station, how many measurements arrived after the poses of their time had been smoothed.
+    ``imu_setup``: monitors the set-up of the IMU, fed beside; None: nothing does. ``outside_lag_window``: by station, how many measurements arrived after the poses of their time had been smoothed.
     Raises DegenerateGeometryError if prisms of the layout coincide or, without an IMU, are fewer than three or collinear.
     """
 
-    def __init__(self, parameters: Parameters, untrusted: Callable[[], str | None] = lambda: None) -> None:
+    def __init__(self, parameters: Parameters, imu_setup: ImuSetupMonitor | None = None) -> None:
         self._parameters = parameters
         self._limits = parameters.pipeline
         self._columns = {prism.prism: column for column, prism in enumerate(parameters.prisms)}
@@ -66,7 +65,7 @@ class ContinuousEstimator:
         self._imu = (
             None
             if parameters.imu is None
-            else ImuTakeover(parameters.imu, self._without_imu, self._create_with_imu, untrusted)
+            else ImuTakeover(parameters.imu, self._without_imu, self._create_with_imu, imu_setup)
         )
         self._pending: list[Measurement] = []
         none = np.empty(0, np.int64)

@@ -1,8 +1,8 @@
 """Checks the configuration of the robot's IMU while the robot drives, from the start. Sans-I/O.
 
-Every 20 s the last 50 s of measurements and samples are compared (`geometry.inertial_calibration.check_imu_setup`). What a
-check finds stands until a later one rules it out. A check takes a quarter of a second of computing: it may run beside, and its
-result counts a fixed time after its start, so that a replay gives the same.
+The last 50 s of measurements and samples are compared (`geometry.inertial_calibration.check_imu_setup`), every 4 s until the
+set-up is confirmed, then every 20 s. What a check finds stands until a later one rules it out. A check takes a quarter of a
+second of computing: it may run beside, and its result counts a fixed time after its start, so that a replay gives the same.
 """
 
 from __future__ import annotations
@@ -33,12 +33,17 @@ StartCheck = Callable[[Callable[[], SetupCheck]], Callable[[], SetupCheck]]
 """Starts a computation, and returns what waits for its result."""
 
 WINDOW_NS = 50_000_000_000
-FIRST_NS = 22_000_000_000  # Of measurements before the first check: two aligned drives have 20 s in common
+FIRST_NS = 12_000_000_000  # Of measurements before the first check: fewer do not tell the mounting
+UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 INTERVAL_NS = 20_000_000_000
-RESULT_NS = 4_000_000_000  # From the start of a check to its result; a slow computer takes a second or two
+RESULT_NS = 2_000_000_000  # From the start of a check to its result; a slow computer takes a second
 
-CONFIRMED: frozenset[Cause] = frozenset({"axes", "rotation", "latency"})
-"""What must be ruled out until the set-up counts as checked. On flat ground the position is not determined."""
+_PARTS: dict[Cause, str] = {
+    "axes": "axes and units",
+    "rotation": "mounting",
+    "position": "position",
+    "latency": "latency",
+}
 
 _REMEDIES: dict[Cause, str] = {
     "unit_of_rate": "let its program give rad/s",
@@ -97,12 +102,23 @@ class ImuSetupMonitor:
         self._result_ns = 0
         self._standing: dict[Cause, SetupFinding] = {}
         self._confirmed = False
+        self._open = tuple(_PARTS.values())
         self._events: list[EventRecord] = []
 
     @property
     def untrusted(self) -> str | None:
         """Why the IMU must not be used: what is wrong in its set-up; None if nothing is known to be."""
         return "; ".join(each.text for each in self._standing.values()) or None
+
+    @property
+    def unconfirmed(self) -> str:
+        """What the drive has not told of the set-up yet, for people; empty when it is confirmed."""
+        return "" if self._confirmed else f"not confirmed by driving yet: {', '.join(self._open)}"
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the drive has confirmed the set-up, and no later check has found it wrong."""
+        return self._confirmed
 
     def take_events(self) -> Sequence[EventRecord]:
         """Return the events since the last call."""
@@ -130,7 +146,7 @@ class ImuSetupMonitor:
             self._records.popleft()
 
     def _begin(self, now_ns: int) -> None:
-        self._next_ns = now_ns + INTERVAL_NS
+        self._next_ns = now_ns + (INTERVAL_NS if self._confirmed else UNCONFIRMED_INTERVAL_NS)
         if not self._records:
             return
         parameters, measurements, records = self._parameters, tuple(self._measurements), tuple(self._records)
@@ -138,6 +154,7 @@ class ImuSetupMonitor:
         self._result_ns = now_ns + RESULT_NS
 
     def _judge(self, check: SetupCheck, now_ns: int) -> None:
+        self._open = tuple(part for cause, part in _PARTS.items() if cause not in check.excluded)
         for cause in check.excluded & self._standing.keys():
             del self._standing[cause]
         for finding in check.findings:
@@ -147,7 +164,8 @@ class ImuSetupMonitor:
             self._standing[finding.cause] = finding
         if self._standing:
             self._confirmed = False
-        elif not self._confirmed and check.excluded >= CONFIRMED:
+        elif not self._confirmed and check.confirmed:
             self._confirmed = True
-            message = "the mounting and the latency of the IMU agree with the drive"
+            self._next_ns = now_ns + INTERVAL_NS
+            message = "mounting, latency, axes and units of the IMU agree with the drive"
             self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_confirmed", message=message))

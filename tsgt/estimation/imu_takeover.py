@@ -1,5 +1,7 @@
 """Takes the trajectory with the IMU while that is sound, and the one without while it is not. Sans-I/O.
 
+Where three stations measure, the IMU is not used before the drive has confirmed its set-up.
+
 Both are tracked all the time from the same measurements, the one without IMU twice a second while it is not needed. So when the
 IMU falls silent, disagrees or turns out to be set up wrongly, the next poses are those of an estimator that never had one.
 """
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import InertialSamples
     from tsgt.geometry.trajectory import Observations, States
@@ -37,6 +40,9 @@ CONTRADICTION_S = 0.4
 """How long measurements may contradict the trajectory with the IMU, and not the one without, until that takes over. A single
 wrong measurement contradicts for no longer: those of the other prisms follow.
 """
+
+UNAIDED_S = 10.0
+"""How long there must have been no trajectory without IMU until one with an unconfirmed IMU is used."""
 
 _POSE_DIM = 6
 
@@ -168,8 +174,7 @@ class ImuTakeover:
     """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
 
     ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement.
-    ``untrusted``: says why the IMU must not be used, None if nothing is known. ``use``: whether poses rest on the IMU, and
-    why not.
+    ``setup``: monitors the set-up of the IMU; None: nothing does. ``use``: whether poses rest on the IMU, and why not.
     """
 
     def __init__(
@@ -177,18 +182,19 @@ class ImuTakeover:
         imu: ImuParameters,
         without: TrajectoryWindow,
         create_with: Callable[[], InertialWindow],
-        untrusted: Callable[[], str | None] = lambda: None,
+        setup: ImuSetupMonitor | None = None,
     ) -> None:
         self._imu = imu
         self._without = without
         self._create_with = create_with
-        self._untrusted = untrusted
+        self._setup = setup
         self._with = create_with()
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
         self._records: deque[ImuSamples] = deque()
         self._newest_s = self._sound_from_s = self._next_comparison_s = -np.inf
         self._contradicted_from_s = np.inf
+        self._unaided_from_s: float | None = None
         self._nis = (0.0, 0.0)  # of the predicted and of a smoothed pose
         self._contradiction = ""
         self.use = ImuUse.STARTING
@@ -204,6 +210,8 @@ class ImuTakeover:
         biases = self._with.biases if self._with.converged else None
         gyro, accelerometer = (None, None) if biases is None else biases
         disagreement = self._disagreement if self.use in _WRONG else ""
+        if self.use == ImuUse.UNCONFIRMED and self._setup is not None:
+            disagreement = self._setup.unconfirmed
         return ImuState(self.use, disagreement, _vector(gyro), _vector(accelerometer))
 
     @property
@@ -251,7 +259,7 @@ class ImuTakeover:
             self._compare(now_s)
         found = self._found(now_s)
         if found in _WRONG:
-            self._disagreement = self._untrusted() or self._contradiction
+            self._disagreement = self._untrusted or self._contradiction
             self._contradicted_from_s, self._nis, self._contradiction = np.inf, (0.0, 0.0), ""
             self._with = self._create_with()
             self._sound_from_s = now_s + QUARANTINE_S
@@ -269,14 +277,28 @@ class ImuTakeover:
         self._without.marginalise_before(before_s)
         self._with.marginalise_before(before_s)
 
+    @property
+    def _untrusted(self) -> str | None:
+        return None if self._setup is None else self._setup.untrusted
+
     def _found(self, now_s: float) -> ImuUse:
-        if self._untrusted() is not None:
+        if self._untrusted is not None:
             return ImuUse.WRONG_SETUP
         if now_s - self._newest_s > SILENCE_S:
             return ImuUse.SILENT if np.isfinite(self._newest_s) else ImuUse.STARTING
         if self._contradicted(now_s):
             return ImuUse.DISAGREES
-        return ImuUse.USED if self._with.converged else ImuUse.STARTING
+        if not self._with.converged:
+            return ImuUse.STARTING
+        return ImuUse.UNCONFIRMED if self._unconfirmed(now_s) else ImuUse.USED
+
+    def _unconfirmed(self, now_s: float) -> bool:
+        """Whether the IMU is not to be used yet. Where no three prisms are measured there is nothing else."""
+        if self._setup is None or self._setup.confirmed:
+            return False
+        if self._without.converged or self._unaided_from_s is None:
+            self._unaided_from_s = now_s
+        return now_s - self._unaided_from_s < UNAIDED_S
 
     def _contradicted(self, now_s: float) -> bool:
         """Whether the IMU is not sound, or the trajectory with it was and is not, while the one without is."""

@@ -38,7 +38,7 @@ class LiveEstimator:
         ):  # fewer do not tell the mounting
             self._setup = ImuSetupMonitor(parameters, start_check)
         self._estimator = (
-            ContinuousEstimator(parameters, self.imu_untrusted) if continuous else LinearEstimator(parameters)
+            ContinuousEstimator(parameters, self._setup) if continuous else LinearEstimator(parameters)
         )
         self._now_ns = -(2**63)
         self._begun = False
@@ -85,10 +85,6 @@ class LiveEstimator:
     def imu_setup_events(self) -> Sequence[EventRecord]:
         """Return the events on the set-up of the IMU since the last call; a replay finds them in its recording."""
         return () if self._setup is None else self._setup.take_events()
-
-    def imu_untrusted(self) -> str | None:
-        """Return what is wrong in the set-up of the IMU; None if nothing is known to be."""
-        return None if self._setup is None else self._setup.untrusted
 
     def outside_lag_window(self) -> Mapping[int, int] | None:
         """Return by station how many measurements arrived outside the lag window; None with ``linear``."""

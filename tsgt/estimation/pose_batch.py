@@ -63,6 +63,7 @@ class ImuUse(IntEnum):
     SILENT = 3
     DISAGREES = 4
     WRONG_SETUP = 5
+    UNCONFIRMED = 6
 
     @property
     def word(self) -> stream_records.ImuUse | None:

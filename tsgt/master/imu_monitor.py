@@ -23,6 +23,7 @@ _CAUSES = {
     "silent": "there is no sample",
     "disagrees": "it disagrees with the measurements of the prisms",
     "wrong_setup": "its set-up is wrong",
+    "unconfirmed": "its set-up is not confirmed by driving yet: drive curves, accelerate and brake",
 }
 
 
@@ -31,6 +32,7 @@ class ImuUseMonitor(Observer):
 
     def __init__(self) -> None:
         self._use = "starting"
+        self._reported = False  # that it is not used
         self._sigmas = (math.inf, math.inf)
         self._next_jump_ns = -(2**63)
 
@@ -41,9 +43,12 @@ class ImuUseMonitor(Observer):
         events = self._jump(record, now_ns)
         self._sigmas = _sigmas(record)
         if record.imu != self._use:
-            # While it is not used its cause may change; there is one event, and one when it is used again.
-            if "used" in (record.imu, self._use):
+            # While it is not used its cause may change; there is one event, and one when it is used again. There is none
+            # for the first seconds, but for an IMU that is not used until the robot drives.
+            lost = self._use == "used" or (record.imu == "unconfirmed" and not self._reported)
+            if record.imu == "used" or lost:
                 events.append(_event(record.imu, now_ns))
+                self._reported = lost
             self._use = record.imu
         return events
 

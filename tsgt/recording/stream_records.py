@@ -34,7 +34,7 @@ Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]
 Quality = Literal["good", "degraded", "invalid"]
 Degradation = Literal["prism_missing", "old_measurements", "uncertain", "ambiguous", "residual"]
-ImuUse = Literal["used", "starting", "silent", "disagrees", "wrong_setup"]
+ImuUse = Literal["used", "starting", "silent", "disagrees", "wrong_setup", "unconfirmed"]
 
 CONTINUOUS_PROMISE = (
     "The sigmas that the pose states, of position at the reference point and of rotation, each in its least certain "
@@ -177,7 +177,8 @@ class PoseRecord(FiniteNumbers):
     imu: ImuUseOrNone = None
     """Whether the pose rests on the robot's IMU: ``used``; ``starting``: not yet, or not again, since its trajectory is not
     certain enough; ``silent``: no sample for 0.3 s; ``disagrees``: with the measurements of the prisms;
-    ``wrong_setup``: a drive has shown that its mounting, latency, axes or units are wrong. Poses without it
+    ``wrong_setup``: a drive has shown that its mounting, latency, axes or units are wrong; ``unconfirmed``: no drive has
+    shown yet that they are right, since the master started. Poses without it
     are those of an estimator without IMU. The key is missing where no IMU is configured."""
     jump_m: float | None = None
     """Of a predicted pose with an IMU configured that is the first after measurements were added, or after the use of the
@@ -295,7 +296,8 @@ class ImuStatus(FiniteNumbers):
     use: ImuUseOrNone = None
     """Whether poses rest on it now, as in a pose; null where the estimator does not tell."""
     disagreement: str = ""
-    """Why the estimator does not believe its samples, which disagree with the prisms, for people; empty when it does."""
+    """Why the estimator does not use its samples: how they disagree with the prisms, what is wrong in its set-up or not
+    confirmed yet, for people; empty when it does."""
     gyro_bias_radps: PositionOrNone = None
     """Bias of the gyro now, as estimated, in its axes, [x, y, z] in rad/s; null while it is not."""
     accelerometer_bias_mps2: PositionOrNone = None

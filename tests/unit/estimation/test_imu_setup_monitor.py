@@ -30,7 +30,9 @@ if TYPE_CHECKING:
     from tsgt.model import ImuParameters, Parameters
     from tsgt.recording import EventRecord
 
-RIGHT = SetupCheck(excluded=frozenset({"axes", "rotation", "latency", "position", "unit_of_rate"}))
+RIGHT = SetupCheck(
+    excluded=frozenset({"axes", "rotation", "latency", "position", "unit_of_rate"}), confirmed=True
+)
 UNKNOWN = SetupCheck()
 
 
@@ -69,20 +71,22 @@ class Monitored:
 def test_right_setup_is_confirmed_once() -> None:
     """The first check that tells confirms; further ones add nothing."""
     monitored = Monitored([UNKNOWN, RIGHT, RIGHT])
-    assert monitored.run(46) == []
-    (event,) = monitored.run(30)
-    assert (event.event, event.stamp_ns) == ("imu_setup_confirmed", START + 46 * SECOND)
+    assert monitored.run(18) == []
+    assert not monitored.monitor.confirmed
+    (event,) = monitored.run(40)
+    assert (event.event, event.stamp_ns) == ("imu_setup_confirmed", START + 18 * SECOND)
     assert monitored.monitor.untrusted is None
+    assert monitored.monitor.confirmed
 
 
 def test_finding_stands_until_it_is_ruled_out() -> None:
     """A wrong set-up is reported once with what to do, and a drive that does not tell leaves it."""
     monitored = Monitored([wrong("rotation"), wrong("rotation"), UNKNOWN, RIGHT])
-    (event,) = monitored.run(60)
+    (event,) = monitored.run(22)
     assert event.event == "imu_setup_wrong"
     assert event.message == "rotation is wrong; calibrate it: tsgt calibrate imu"
-    assert event.stamp_ns == START + 26 * SECOND
-    assert monitored.run(20) == []
+    assert event.stamp_ns == START + 14 * SECOND
+    assert monitored.run(3) == []
     assert monitored.monitor.untrusted == "rotation is wrong"
     (event,) = monitored.run(30)
     assert event.event == "imu_setup_confirmed"
@@ -92,9 +96,10 @@ def test_finding_stands_until_it_is_ruled_out() -> None:
 def test_knock_after_confirmation_is_reported() -> None:
     """A set-up that was right may become wrong, and each cause is named."""
     monitored = Monitored([RIGHT, wrong("rotation"), wrong("latency")])
-    events = monitored.run(80)
+    events = monitored.run(60)
     assert [each.event for each in events] == ["imu_setup_confirmed", "imu_setup_wrong", "imu_setup_wrong"]
     assert monitored.monitor.untrusted == "rotation is wrong; latency is wrong"
+    assert not monitored.monitor.confirmed
 
 
 @dataclass

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from harness.records import IMU_PARAMETERS, imu_samples
 from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
 from tsgt.estimation import LiveEstimator, imu_setup_monitor
-from tsgt.estimation.imu_takeover import QUARANTINE_S, SILENCE_S, SOUND_S
+from tsgt.estimation.imu_takeover import QUARANTINE_S, SILENCE_S, SOUND_S, UNAIDED_S, ImuTakeover
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.geometry.trajectory import FixedLagSmoother
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 LINE_S = 0.05
 UP_M = 0.02
+RIGHT = SetupCheck(confirmed=True)
 
 
 class FakeInertialSmoother(FixedLagSmoother):
@@ -62,6 +64,8 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     """Three stations, a robot that drives a bend, and an IMU."""
     FakeInertialSmoother.created.clear()
     monkeypatch.setattr("tsgt.estimation.continuous.InertialFixedLagSmoother", FakeInertialSmoother)
+    monkeypatch.setattr(imu_setup_monitor, "FIRST_NS", 0)
+    monkeypatch.setattr(imu_setup_monitor, "RESULT_NS", 0)
     scene = stationary_scene().moving(driving).with_limits(estimator="continuous", period_ns=100_000_000)
     return replace(scene, parameters=replace(scene.parameters, imu=IMU_PARAMETERS))
 
@@ -83,9 +87,14 @@ def arrivals(
     return sorted(found, key=lambda each: each.received_ns)
 
 
+def checked(scene: Scene, check: SetupCheck = RIGHT) -> LiveEstimator:
+    """Return a live estimator whose checks of the set-up give one result."""
+    return LiveEstimator(scene.parameters, lambda _work: lambda: check)
+
+
 def records(scene: Scene, arrived: list[Measurement | ImuSamples]) -> list[Any]:
     """Hand arrivals to a live estimator and return its records."""
-    live = LiveEstimator(scene.parameters)
+    live = checked(scene)
     return [
         record
         for each in arrived
@@ -152,7 +161,7 @@ def test_silence_gives_the_poses_without_imu_and_sound_samples_take_it_back(scen
 def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any], cause: str) -> None:
     """Until nothing from before is in the window."""
     arrived = arrivals(scene, 7.2)
-    live = LiveEstimator(scene.parameters)
+    live = checked(scene)
     poses: list[PoseRecord] = []
     states: list[ImuState | None] = []
     for each in arrived:
@@ -172,20 +181,60 @@ def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any],
 
 def test_wrong_setup_is_left_out_from_its_event_on(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses do not rest on an IMU that a drive has shown to be set up wrongly."""
-    monkeypatch.setattr(imu_setup_monitor, "FIRST_NS", SECOND)
-    monkeypatch.setattr(imu_setup_monitor, "RESULT_NS", SECOND)
     wrong = SetupCheck((SetupFinding("rotation", 0.02, 0.001, "the mounting is wrong"),))
-    live = LiveEstimator(scene.parameters, lambda _work: lambda: wrong)
+    checks = [RIGHT, wrong]
+    monkeypatch.setattr(imu_setup_monitor, "INTERVAL_NS", 2 * SECOND)
+    live = LiveEstimator(scene.parameters, lambda _work: lambda: checks.pop(0))
     poses: list[PoseRecord] = []
     for each in arrivals(scene, 4.0):
         found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
         poses += predicted(list(found))
-    (event,) = live.imu_setup_events()
+    _, event = live.imu_setup_events()
     assert event.event == "imu_setup_wrong"
-    assert live.imu_untrusted() == "the mounting is wrong"
+    state = live.imu_state()
+    assert state is not None
+    assert state.disagreement == "the mounting is wrong"
     _, _, (use, from_s) = uses_from(poses)
     assert use == "wrong_setup"
     assert from_s == pytest.approx((event.stamp_ns - START) / SECOND, abs=0.11)
+
+
+def test_unconfirmed_imu_is_not_used(scene: Scene) -> None:
+    """Poses are those without it, and the status says what the drive has not told yet."""
+    live = checked(scene, SetupCheck(excluded=frozenset({"axes"})))
+    poses: list[PoseRecord] = []
+    for each in arrivals(scene, 3.0):
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    _, (use, _) = uses_from(poses)
+    assert use == "unconfirmed"
+    assert poses[-1].position_m is not None
+    assert poses[-1].position_m[2] == pytest.approx(-1.0, abs=1e-3)
+    state = live.imu_state()
+    assert state is not None
+    assert state.disagreement == "not confirmed by driving yet: mounting, position, latency"
+
+
+def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
+    """Two of three stations that measure have no poses without it; with the third there are."""
+    without = SimpleNamespace(converged=False, ambiguous=False)
+    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
+    setup = SimpleNamespace(untrusted=None, confirmed=False)
+    takeover = ImuTakeover(
+        IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
+    )
+    takeover.begin(START)
+    uses = []
+    for number in range(3 * round(UNAIDED_S)):
+        takeover.add_samples(imu_samples(100 * number, count=100))
+        takeover.take_samples()
+        takeover.choose(0.5 * (number + 1))
+        uses.append(takeover.use)
+        without.converged = number >= 2.5 * UNAIDED_S
+        without.ambiguous = True
+    changes = [use for use, _ in itertools.groupby(uses)]
+    assert changes == [ImuUse.UNCONFIRMED, ImuUse.USED, ImuUse.UNCONFIRMED]
+    assert uses.index(ImuUse.USED) == round(2 * UNAIDED_S)
 
 
 def test_first_pose_after_a_measurement_states_its_jump(scene: Scene) -> None:

@@ -27,6 +27,16 @@ def test_use_and_loss_are_events_once() -> None:
     assert names(ImuUseMonitor(), *uses) == ["imu_used", "imu_not_used", "imu_used", "imu_not_used"]
 
 
+def test_unconfirmed_setup_is_an_event() -> None:
+    """The operator has to drive; it is no loss."""
+    monitor = ImuUseMonitor()
+    assert names(monitor, "starting") == []
+    (event,) = monitor.pose(replace(PREDICTED, imu="unconfirmed"), START)
+    assert event.event == "imu_not_used"
+    assert "not confirmed by driving yet" in event.message
+    assert names(monitor, "unconfirmed", "starting", "unconfirmed", "used") == ["imu_used"]
+
+
 def test_event_names_the_cause() -> None:
     """In words."""
     monitor = ImuUseMonitor()

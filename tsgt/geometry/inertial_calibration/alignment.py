@@ -90,13 +90,19 @@ def series_of_samples(samples: InertialSamples) -> Series:
     return _smoothed(start_s, grid_s, grid_s, rate, force, known)
 
 
-def align(robot: Series, imu: Series, *, max_latency_s: float = MAX_LATENCY_S) -> Alignment:
+def align(
+    robot: Series,
+    imu: Series,
+    *,
+    max_latency_s: float = MAX_LATENCY_S,
+    min_overlap_s: float = MIN_OVERLAP_S,
+) -> Alignment:
     """Find mounting and latency. Raises GeometryError: the robot hardly turns, or no latency explains the rates."""
     if not turns(robot):
         raise GeometryError(
             f"the robot hardly turns (rms below {np.degrees(MIN_TURNING_RADPS):.1f} deg/s): drive curves, slopes and bumps"
         )
-    lags, scores = _rate_scores(robot, imu, max_latency_s)
+    lags, scores = _rate_scores(robot, imu, max_latency_s, min_overlap_s)
     best = int(np.argmax(scores))
     correlation = float(scores[best])
     turning = _turning(robot)
@@ -144,7 +150,9 @@ def nearest_rotation(products: FloatArray) -> FloatArray:
     return rotation
 
 
-def _rate_scores(robot: Series, imu: Series, max_latency_s: float) -> tuple[NDArray[np.intp], FloatArray]:
+def _rate_scores(
+    robot: Series, imu: Series, max_latency_s: float, min_overlap_s: float
+) -> tuple[NDArray[np.intp], FloatArray]:
     """Shifts of the IMU's grid against the robot's, in steps, and the correlation of the rates, aligned, at each."""
     lags = np.arange(-len(robot.rate) + 1, len(imu.rate))
     known, theirs = robot.known.astype(np.float64), imu.known.astype(np.float64)
@@ -163,10 +171,10 @@ def _rate_scores(robot: Series, imu: Series, max_latency_s: float) -> tuple[NDAr
     square_a = correlated((a**2).sum(axis=1), theirs) - (sum_a**2).sum(axis=1) / count
     square_b = correlated(known, (b**2).sum(axis=1)) - (sum_b**2).sum(axis=1) / count
     latency_s = imu.start_s - robot.start_s + lags * GRID_S
-    allowed = (np.abs(latency_s) <= max_latency_s) & (count * GRID_S >= MIN_OVERLAP_S)
+    allowed = (np.abs(latency_s) <= max_latency_s) & (count * GRID_S >= min_overlap_s)
     if not allowed.any():
         raise GeometryError(
-            f"samples of the IMU and measurements have less than {MIN_OVERLAP_S:g} s in common"
+            f"samples of the IMU and measurements have less than {min_overlap_s:g} s in common"
         )
     lags, products = lags[allowed], products[allowed]
     singular = np.linalg.svd(products, compute_uv=False)

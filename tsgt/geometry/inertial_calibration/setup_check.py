@@ -18,6 +18,8 @@ from tsgt.errors import GeometryError
 from tsgt.geometry.inertial import Mounting, contiguous
 from tsgt.geometry.inertial.states import TILT_DIM
 from tsgt.geometry.inertial_calibration.alignment import (
+    GRID_S,
+    MIN_OVERLAP_S,
     align,
     nearest_rotation,
     products_at,
@@ -27,7 +29,14 @@ from tsgt.geometry.inertial_calibration.alignment import (
 )
 from tsgt.geometry.inertial_calibration.joint_solver import solve_jointly, states_of_imu
 from tsgt.geometry.inertial_calibration.joint_system import stamp_times
-from tsgt.geometry.inertial_calibration.setup import LATENCY, POSITION, ImuSetup, SetupPrior, gyro_rotation
+from tsgt.geometry.inertial_calibration.setup import (
+    LATENCY,
+    POSITION,
+    ROTATION,
+    ImuSetup,
+    SetupPrior,
+    gyro_rotation,
+)
 from tsgt.geometry.rigid import log_so3
 
 if TYPE_CHECKING:
@@ -51,8 +60,11 @@ MIN_LATENCY_S = 0.004
 """Errors below these harm little: a few tenths of a millimetre, a few hundredths of a degree."""
 
 MIN_SIGNIFICANCE = 5.0  # Sigmas, of three components together
-EXCLUDED_LIMITS, EXCLUDED_SIGMAS = 2.0, 3.0
+EXCLUDED_LIMITS, EXCLUDED_SIGMAS = 2.0, 2.0
 """An error is ruled out if it is below this many of the limits above, with this many sigmas added."""
+
+MIN_OVERLAP_SHARE = 0.6
+"""Of the shorter series, which the other one must overlap at any latency that is tried."""
 
 MIN_MEASUREMENTS = 60
 MATRIX_SIGMA = 1e-2  # Of the matrices beside what is configured
@@ -85,6 +97,8 @@ class SetupCheck:
 
     findings: tuple[SetupFinding, ...] = ()
     excluded: frozenset[Cause] = frozenset()  # Causes that it rules out
+    confirmed: bool = False
+    """Whether it rules out all that harms: every cause, but for an error of the IMU's height, which flat ground does not tell."""
 
 
 def check_imu_setup(
@@ -114,7 +128,8 @@ def check_imu_setup(
     if units:
         return SetupCheck(tuple(units))
     try:
-        alignment = align(robot, imu)
+        shorter_s = GRID_S * min(len(robot.rate), len(imu.rate))
+        alignment = align(robot, imu, min_overlap_s=min(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s))
     except GeometryError:
         text = "the angular rates of the IMU are not those of the robot at any latency: it is another robot's"
         return SetupCheck((SetupFinding("unrelated", 0.0, 0.0, text),))
@@ -216,19 +231,28 @@ def _estimated_errors(
         ("position", identity[POSITION], MIN_POSITION_M),
         ("latency", identity[LATENCY : LATENCY + 1], MIN_LATENCY_S),
     )
+
+    def is_excluded(jacobian: FloatArray, limit: float) -> bool:
+        """Whether an error is small for certain."""
+        part, own = jacobian @ error, jacobian @ covariance @ jacobian.T
+        sigma = np.sqrt(np.linalg.eigvalsh(own)[-1])
+        return bool(np.linalg.norm(part) + EXCLUDED_SIGMAS * sigma < EXCLUDED_LIMITS * limit)
+
     findings: list[SetupFinding] = []
-    excluded: set[Cause] = set()
+    excluded: set[Cause] = {cause for cause, jacobian, limit in parts if is_excluded(jacobian, limit)}
+    if is_excluded(identity[ROTATION], MIN_ROTATION_RAD):
+        excluded.add("rotation")  # of the accelerometer, sooner than of the gyro about the vertical
     for cause, jacobian, limit in parts:
         part, own = jacobian @ error, jacobian @ covariance @ jacobian.T
         size = float(np.linalg.norm(part))
-        if size + EXCLUDED_SIGMAS * np.sqrt(np.linalg.eigvalsh(own)[-1]) < EXCLUDED_LIMITS * limit:
-            excluded.add(cause)
         if size < limit or part @ np.linalg.solve(own, part) < MIN_SIGNIFICANCE**2:
             continue
         sigma = float(np.sqrt(part @ own @ part)) / size
         findings.append(SetupFinding(cause, size, sigma, _describe(cause, part, sigma, mounting)))
         excluded.discard(cause)
-    return SetupCheck(tuple(findings), frozenset(excluded))
+    confirmed = not findings and excluded >= {"rotation", "latency"}
+    confirmed &= is_excluded(identity[POSITION][:2], MIN_POSITION_M)
+    return SetupCheck(tuple(findings), frozenset(excluded), confirmed)
 
 
 def _describe(cause: Cause, error: FloatArray, sigma: float, mounting: Mounting) -> str:

@@ -156,6 +156,7 @@ def test_right_setup_is_not_reported(grade: str) -> None:
     check = drive(grade).check()
     assert check.findings == ()
     assert check.excluded >= {"axes", "rotation", "latency"}
+    assert check.confirmed
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from tsgt.client.blocking import Stream
 from tsgt.client.decoder import ProtocolVersionError
+from tsgt.client.points import measured_point
 from tsgt.client.records import (
     PROTOCOL_VERSION,
     DiskStatus,
@@ -17,6 +18,7 @@ from tsgt.client.records import (
     Gap,
     Hello,
     ImuStatus,
+    Measurement,
     Pose,
     Record,
     RecordingStatus,
@@ -46,6 +48,7 @@ __all__ = [
     "Gap",
     "Hello",
     "ImuStatus",
+    "Measurement",
     "Pose",
     "ProtocolVersionError",
     "Record",
@@ -61,6 +64,7 @@ __all__ = [
     "Stream",
     "ValidityLimits",
     "default_max_age_s",
+    "measured_point",
 ]
 
 

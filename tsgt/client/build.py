@@ -8,17 +8,18 @@ from dataclasses import MISSING, Field, fields
 from functools import cache
 from typing import Any, NoReturn, TypeVar
 
-from tsgt.client.records import Event, Hello, Pose, Setup, Status
+from tsgt.client.records import Event, Hello, Measurement, Pose, Setup, Status
 from tsgt.errors import StreamError
 
 T = TypeVar("T")
 
 _SHOWN_CHARACTERS = 80
 
-TYPES: dict[str, type[Hello | Setup | Pose | Status | Event]] = {
+TYPES: dict[str, type[Hello | Setup | Pose | Measurement | Status | Event]] = {
     "hello": Hello,
     "setup": Setup,
     "pose": Pose,
+    "measurement": Measurement,
     "status": Status,
     "event": Event,
 }

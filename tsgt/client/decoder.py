@@ -1,4 +1,4 @@
-"""Sans-I/O: lines become records, and each pose learns its place on the clock of this computer."""
+"""Sans-I/O: lines become records; poses and measurements get their time on the clock of this computer."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from tsgt.client.build import TYPES, build, load
 from tsgt.client.delay import LeastDelay
-from tsgt.client.records import PROTOCOL_VERSION, Event, Gap, Pose, Record
+from tsgt.client.records import PROTOCOL_VERSION, Event, Gap, Measurement, Pose, Record
 from tsgt.errors import StreamError
 
 if TYPE_CHECKING:
@@ -51,18 +51,18 @@ class Decoder:
         cls = TYPES.get(kind)
         if cls is None:
             return
-        if cls is not Pose:
-            record = build(cls, data)
-            yield record
-            if isinstance(record, Event) and record.event == "lines_lost":
-                yield Gap(lines=record.count, reason="this reader was too slow for the master")
+        if cls is Pose or cls is Measurement:
+            yield build(cls, data, epoch_ns=self._epoch_ns(data, arrival))
             return
-        yield build(Pose, data, epoch_ns=self._epoch_ns(data, arrival))
+        record = build(cls, data)
+        yield record
+        if isinstance(record, Event) and record.event == "lines_lost":
+            yield Gap(lines=record.count, reason="this reader was too slow for the master")
 
     def _epoch_ns(self, data: dict[str, Any], arrival: Arrival) -> int:
         stamp_ns = data.get("stamp_ns")
         if not isinstance(stamp_ns, int):
-            raise StreamError("a pose has no integer stamp_ns")
+            raise StreamError(f"a {data['type']} has no integer stamp_ns")
         at_ns = self._delay.here_ns(stamp_ns) if self._delay.known else arrival.arrived_ns
         return self._link.here_ns(at_ns)
 

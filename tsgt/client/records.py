@@ -73,6 +73,10 @@ class SetupStation:
     instrument: str | None = None
     latency_s: float
     prism: int
+    prism_constant_m: float
+    atmospheric_ppm: float
+    vertical_index_rad: float
+    collimation_rad: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,6 +194,32 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """One raw measurement of a prism; :func:`~tsgt.client.measured_point` makes a point of it."""
+
+    station: int
+    prism: int
+    sequence: int
+    stamp_ns: int
+    stamp_sigma_ns: int = 0
+    stamp_bound_ns: int | None = None
+    received_ns: int
+    horizontal_angle_rad: float
+    zenith_angle_rad: float
+    slope_distance_m: float | None
+    status: str = "ok"
+    raw_status: int = 0
+    host_time_ns: int | None
+    instrument_time_ns: int | None = None
+    epoch_ns: int = 0
+    """Time of the measurement on :func:`monotonic_ns` of this computer; see :meth:`age_s`."""
+
+    def age_s(self, now_ns: int | None = None) -> float:
+        """Return the time since it was measured in s, by this computer's clock alone, as :meth:`Pose.age_s` does."""
+        return ((monotonic_ns() if now_ns is None else now_ns) - self.epoch_ns) / 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StationStatus:
     """The status of one station."""
 
@@ -303,4 +333,4 @@ class Gap:
     """Why, in one line."""
 
 
-Record = Hello | Setup | Pose | Status | Event | Gap
+Record = Hello | Setup | Pose | Measurement | Status | Event | Gap

@@ -55,6 +55,14 @@ class SetupStation(FiniteNumbers):
     """From a measurement to its stamp, in s, which is subtracted. Positive: the stamp is late."""
     prism: int
     """Number of the prism that it tracks by configuration; what it tracks at the moment is in ``status``."""
+    prism_constant_m: float
+    """Added to its slope distances after the atmospheric correction, in m."""
+    atmospheric_ppm: float
+    """Atmospheric correction of its raw slope distances in ppm."""
+    vertical_index_rad: float
+    """Vertical index error, which is subtracted from its zenith angles, in rad."""
+    collimation_rad: float
+    """Collimation error, which over sin(zenith angle) is added to its horizontal angles, in rad."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,6 +181,10 @@ def _station(station: StationParameters, known: SetupCovariance | None) -> Setup
         covariance=_frame_covariance(station.station, known),
         latency_s=station.latency_ns / 1e9,
         prism=station.prism,
+        prism_constant_m=station.prism_constant_m,
+        atmospheric_ppm=station.atmospheric_ppm,
+        vertical_index_rad=station.vertical_index_rad,
+        collimation_rad=station.collimation_rad,
     )
 
 

@@ -26,6 +26,7 @@ CLASSES = {
     "ValidityLimits": records.ValidityLimits,
     "PoseRecord": records.Pose,
     "StationShare": records.StationShare,
+    "PolarMeasurement": records.Measurement,
     "StatusRecord": records.Status,
     "StationStatus": records.StationStatus,
     "ImuStatus": records.ImuStatus,

@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.records import EVENT, HELLO, NO_POSE, POSE, STATUS, measurement
 
-from tsgt.client import AsyncStream, Event, Gap, Hello, Pose, ProtocolVersionError, Status, Stream
+from tsgt.client import (
+    AsyncStream,
+    Event,
+    Gap,
+    Hello,
+    Measurement,
+    Pose,
+    ProtocolVersionError,
+    Status,
+    Stream,
+)
 from tsgt.errors import StreamError
 from tsgt.recording import encode_line
 
@@ -86,7 +96,7 @@ def test_records_arrive_in_order(tmp_path: Path, read: Callable[..., list[Record
     sent = (HELLO, measurement(0), b'{"type":"weather"}', PREDICTED, STATUS, NO_POSE)
     with serving(tmp_path / "s", lines(*sent)):
         found = read(tmp_path / "s", 99, reconnect=False)
-    assert [type(record) for record in found] == [Hello, Pose, Status, Pose]
+    assert [type(record) for record in found] == [Hello, Measurement, Pose, Status, Pose]
 
 
 @both

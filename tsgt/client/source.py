@@ -55,7 +55,7 @@ def parse_source(source: str | os.PathLike[str]) -> SocketSource | RelaySource:
 
 
 def read_key_file(path: str | os.PathLike[str]) -> bytes:
-    """Read a relay's key, as ``tsgt radio key`` makes it; raises StreamError if it is none, or others may read it."""
+    """Read a relay's key, as ``tsgt relay --make-key`` makes it; raises StreamError if it is none, or others may read it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:

@@ -73,7 +73,9 @@ class Tls:
 
     def send(self, plain: bytes) -> None:
         """Encrypt; see :meth:`outgoing`. Only while open."""
-        self._tls.write(plain)
+        view = memoryview(plain)
+        while view:
+            view = view[self._tls.write(view) :]
 
     def outgoing(self) -> bytes:
         """Return the encrypted bytes that are to be sent now."""

@@ -1,4 +1,4 @@
-"""The file with the key that all radios of a mission share: one line of 64 hexadecimal digits.
+"""The file with a key, which all radios of a mission share, or a relay and its readers: one line of 64 hexadecimal digits.
 
 Only its owner, the user who runs the daemon, may have access to it or be able to replace it; otherwise it is rejected,
 as ssh rejects private keys.
@@ -25,25 +25,28 @@ _DIGITS = 2 * KEY_BYTES
 _MAX_FILE_BYTES = 1024
 
 
-def read_key(path: Path, *, owner: int | None = None) -> bytes:
-    """Read the key of a mission.
+MAKE_KEY = "tsgt radio key"
+
+
+def read_key(path: Path, *, owner: int | None = None, make_key: str = MAKE_KEY) -> bytes:
+    """Read a key.
 
     ``path``: a file made by :func:`write_key`, or a copy of it. ``owner``: required user id; None: that of this
-    process. Raises ConfigError if there is no such file, another user owns it or may read, write or replace it, or its
+    process. ``make_key``: the command that makes such a file, for errors. Raises ConfigError if there is no such file, another user owns it or may read, write or replace it, or its
     content is no key.
     """
     try:
         # Opening a pipe must not block.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
-            check_access(path, os.fstat(descriptor), os.geteuid() if owner is None else owner)
+            check_access(path, os.fstat(descriptor), os.geteuid() if owner is None else owner, make_key)
             check_permissions(path, user=owner)
             content = os.read(descriptor, _MAX_FILE_BYTES)
         finally:
             os.close(descriptor)
     except FileNotFoundError:
         raise ConfigError(
-            f"{path}: no such file; copy the mission's key there, or create one with `tsgt radio key {path}`",
+            f"{path}: no such file; copy the key there, or create one with `{make_key} {path}`",
             path=path,
         ) from None
     except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
@@ -55,7 +58,7 @@ def read_key(path: Path, *, owner: int | None = None) -> bytes:
     if len(content) == _MAX_FILE_BYTES or re.fullmatch(rb"\s*[0-9A-Fa-f]{%d}\s*" % _DIGITS, content) is None:
         raise ConfigError(
             f"{path}: not a key, which is one line of {_DIGITS} hexadecimal digits; copy the unchanged file of "
-            "another radio of the mission",
+            "another computer that has it",
             path=path,
         )
     return bytes.fromhex(content.decode("ascii"))
@@ -83,13 +86,13 @@ def write_key(path: Path) -> None:
         raise OutputFileError(f"cannot be written ({error.strerror})", path=path) from error
 
 
-def check_access(path: Path, status: os.stat_result, owner: int) -> None:
+def check_access(path: Path, status: os.stat_result, owner: int, make_key: str = MAKE_KEY) -> None:
     """Check that a key file belongs to the user id ``owner`` alone.
 
     Raises ConfigError if it is no regular file, belongs to another user, or another user may read or write it.
     """
     if not stat.S_ISREG(status.st_mode):
-        raise ConfigError(f"{path}: not a file; name one made with `tsgt radio key`", path=path)
+        raise ConfigError(f"{path}: not a file; name one made with `{make_key}`", path=path)
     if status.st_uid != owner:
         user = _user(owner)
         raise ConfigError(

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.cli.line_reader import connect
+from tsgt.cli.live import connect, setting_lines
 from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, json_option, path_type
 from tsgt.cli.output import printable
-from tsgt.cli.status import setting_lines
 from tsgt.errors import InstrumentError, StreamError
 from tsgt.recording import Typed, decode, encode_line
 from tsgt.station import AtmosphereRequest, AtmosphereResponse
@@ -18,7 +17,7 @@ from tsgt.station import AtmosphereRequest, AtmosphereResponse
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.cli.line_reader import LineReader
+    from tsgt.cli.live import LineReader
 
 STATUS_TIMEOUT_S = 5.0
 """A client sends its status at once; one that does not is stuck."""

@@ -126,7 +126,7 @@ def _client_status(path: Path) -> ClientStatus | None:
     """Request the status of a client; None if its socket is not served."""
     if not _is_served(path):
         return None
-    from tsgt.cli.status import status_of
+    from tsgt.cli.live.status import status_of
     from tsgt.station import ClientStatus
 
     record, _ = status_of(path)

@@ -24,8 +24,8 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
             "calibrate.group:calibrate",
             "Calibrate station frames, prism layout, latencies and IMU.",
         ),
-        "status": ("status:status", "Show the status of the daemon on this machine."),
-        "listen": ("live:listen", "Print the pose stream as text."),
+        "status": ("live.status:status", "Show the status of the daemon on this machine."),
+        "listen": ("live.listen:listen", "Print the pose stream as text."),
         "relay": ("relay:relay", "Serve the pose stream to other computers."),
         "imu": ("imu:imu", "Read an IMU for the master."),
         "atmosphere": ("atmosphere:atmosphere", "Set temperature and pressure of the instrument."),
@@ -44,7 +44,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
     "Development": {
         "demo": ("simulate.demo:demo", "Run simulated stations and a master in real time."),
         "simulate": ("simulate.command:simulate_command", "Simulate a mission in virtual time."),
-        "replay": ("live:replay", "Stream a recording again."),
+        "replay": ("live.replay:replay", "Stream a recording again."),
     },
 }
 """By heading of ``tsgt --help``: each command, where it is defined in this package, and its summary.

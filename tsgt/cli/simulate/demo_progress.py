@@ -14,7 +14,7 @@ import click
 import numpy as np
 
 from tsgt.analysis.evaluation import LivePoseErrors, LivePoses, interior_mask, newest_age_s
-from tsgt.cli.status import station_label
+from tsgt.cli.live import station_label
 from tsgt.estimation import centroid_at_point, point_label, sigma_limits_of, transform_of
 from tsgt.geometry import rotation_from_quaternion, transform_from
 from tsgt.recording import EventRecord, PoseRecord, StatusRecord, decode

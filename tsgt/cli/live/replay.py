@@ -1,4 +1,4 @@
-"""Commands on the live stream: ``tsgt listen`` and ``tsgt replay``."""
+"""The command ``tsgt replay``."""
 
 from __future__ import annotations
 
@@ -9,40 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tsgt import service
-from tsgt.cli.line_reader import connect
 from tsgt.cli.options import keep_going_option, recording_argument, socket_option
-from tsgt.cli.output import printable, report_problem
-from tsgt.cli.render import render
+from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
-from tsgt.errors import RecordingError, StreamError
+from tsgt.errors import RecordingError
 from tsgt.master.stream_server import StreamServer
-from tsgt.recording import Typed, decode, encode_line
+from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
-
-
-@click.command()
-@socket_option
-@click.option("--json", "as_json", is_flag=True, help="Print the lines as received, one JSON object each.")
-@click.option("--count", type=click.IntRange(min=1), help="Number of lines to print.  [default: all]")
-def listen(socket_path: Path, *, as_json: bool, count: int | None) -> None:
-    """Print the pose stream as text.
-
-    Prints one line per record until the stream ends.
-    """
-    for line in itertools.islice(_lines(socket_path), count):
-        if as_json:
-            click.echo(line, nl=False)
-            continue
-        try:
-            text = render(decode(Typed, line).type, line)
-        except ValueError as error:
-            click.echo(f"warning: unreadable line: {error}", err=True)
-        else:
-            if text is not None:
-                click.echo(printable(text))
 
 
 class _Speed(click.FloatRange):
@@ -73,7 +48,7 @@ def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep
     The recorded measurements pass through the live pipeline in their order and at their times of arrival, so that the
     stream is identical to the last bit at any speed. The replay waits for slow readers.
     """
-    # Imported here, so that `tsgt listen` starts without numpy.
+    # Imported here, so that `tsgt replay --help` starts without numpy.
     from tsgt.master.replay import greeting, replayed
     from tsgt.master.replay import replay as play
 
@@ -94,23 +69,3 @@ def replay(recording: Path, *, socket_path: Path, speed: float, wait: bool, keep
             return lines
 
     click.echo(f"{service.run(serve)} lines replayed", err=True)
-
-
-def _lines(socket_path: Path) -> Iterator[bytes]:
-    connected = False
-    try:
-        with connect(socket_path) as reader:
-            connected = True
-            while line := reader.line():
-                yield line
-    except ConnectionResetError:  # the server closes the connection of a reader that is too slow at the end
-        return
-    except ValueError as error:
-        raise StreamError(f"{socket_path}: not a stream of tsgt: {error}") from error
-    except OSError as error:
-        if connected:
-            raise
-        raise StreamError(
-            f"{socket_path}: no stream ({error.strerror or error}); start tsgt-master, tsgt demo or tsgt replay, or "
-            "give the right --socket"
-        ) from error

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import pytest
 from harness.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
 
 from tsgt.recording import encode_line
@@ -138,5 +139,40 @@ def test_stale_socket_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
 
 def test_listening_needs_neither_numpy_nor_scipy() -> None:
     """The command starts fast on a small computer."""
-    check = "import sys, tsgt.cli.live; sys.exit(bool({'numpy', 'scipy'} & sys.modules.keys()))"
+    check = "import sys, tsgt.cli.live.listen; sys.exit(bool({'numpy', 'scipy'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+def test_lines_are_selected(tsgt: Tsgt, tmp_path: Path) -> None:
+    """By kind and time, as text and as received; --count counts the lines printed."""
+    data = b"".join(line + b"\n" for line in LINES)
+    with serving(tmp_path / "s", data):
+        outcome = tsgt("listen", "--socket", tmp_path / "s", "--kind", "pose,event", "--count", 2, "--json")
+    assert outcome.out.encode().splitlines() == [LINES[3], LINES[4]]
+    with serving(tmp_path / "s2", data):
+        outcome = tsgt("listen", "--socket", tmp_path / "s2", "--since", "2023-11-14T22:13:21.5Z")
+    assert [line[:12] for line in outcome.out.splitlines()[1:]] == ["22:13:22.000", "22:13:23.000"]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--kind", "poses", "unknown kind 'poses'; known: pose, smoothed"),
+        ("--since", "yesterday", "is neither a time such as"),
+        ("--rate", "0", "--rate"),
+    ],
+)
+def test_wrong_selection_is_a_usage_error(
+    tsgt: Tsgt, tmp_path: Path, option: str, value: str, message: str
+) -> None:
+    """Before anything is connected."""
+    outcome = tsgt("listen", "--socket", tmp_path / "s", option, value)
+    assert outcome.code == 2
+    assert message in outcome.err
+
+
+def test_warning_of_lost_lines_is_never_hidden(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Whatever was selected."""
+    with serving(tmp_path / "s", b"".join(line + b"\n" for line in LINES)):
+        outcome = tsgt("listen", "--socket", tmp_path / "s", "--kind", "pose", "--json")
+    assert outcome.err == "warning: lost 7 lines\n"

@@ -1,39 +1,22 @@
-"""The command ``status``: the state of the daemon on this machine, legible on a small screen in sunlight."""
+"""The status of a daemon as text, legible on a small screen in sunlight."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 import textwrap
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.cli.line_reader import connect
-from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, DEFAULT_SOCKET, path_type
-from tsgt.cli.output import CHECK_FAILED, printable
+from tsgt.cli.output import printable
 from tsgt.cli.render import clock_time
-from tsgt.errors import StreamError
 from tsgt.model import Status
-from tsgt.recording import (
-    DiskStatus,
-    HelloRecord,
-    ImuStatus,
-    RecordingStatus,
-    StationStatus,
-    StatusRecord,
-    Typed,
-    decode,
-)
-from tsgt.station import ClientStatus
 
 if TYPE_CHECKING:
+    from tsgt.recording import DiskStatus, ImuStatus, RecordingStatus, StationStatus, StatusRecord
     from tsgt.recording.journal import InstrumentRecord
-
-TIMEOUT_S = 5.0
-"""A master sends its status each second; one that sends none for this long is stuck."""
+    from tsgt.station import ClientStatus
 
 MAX_AGE_S = 3.0
 """A station whose last packet or measurement is older needs the operator."""
@@ -63,64 +46,51 @@ LABELS = {
 }
 
 
-@click.command()
-@click.option(
-    "--socket",
-    "socket_path",
-    type=path_type,
-    envvar="TSGT_SOCKET",
-    show_envvar=True,
-    help=f"Socket of a master or a client.  [default: {DEFAULT_SOCKET}, else {DEFAULT_CLIENT_SOCKET}]",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the status record as received.")
-def status(socket_path: Path | None, *, as_json: bool) -> int:
-    """Show the status of the daemon on this machine.
-
-    A master reports all its stations, a client its own station.
-
-    Exit code 1: no daemon runs. 3: a daemon runs, but action is required: a station is not received or does not track,
-    the IMU gives no samples or disagrees with the prisms, the disk fails, or no pose is valid.
-    """
-    record, line = _request(socket_path)
-    text, ok = client_text(record) if isinstance(record, ClientStatus) else master_text(record)
-    click.echo(line.rstrip() if as_json else "\n".join(text))
-    return 0 if ok else CHECK_FAILED
+Block = list[str]
+"""Lines of at most :data:`WIDTH` characters that belong together; the first is a headline."""
 
 
 def master_text(record: StatusRecord) -> tuple[list[str], bool]:
     """Return a master's status in lines of at most 40 characters, and whether no action is required."""
-    lines = [
+    head = [
         f"MASTER  {clock_time(record.stamp_ns)} UTC",
         f"poses {record.poses}, valid {record.valid_poses}",
     ]
     if record.frame_ms is not None:
-        lines.append(f"frame {record.frame_ms:.0f} ms")
+        head.append(f"frame {record.frame_ms:.0f} ms")
     if record.protocol == "superframe" and not record.authenticated:
-        lines.append(_headline(NO_KEY, ok=False))
-    ok = record.valid_poses > 0
+        head.append(_headline(NO_KEY, ok=False))
+    blocks, problems = master_blocks(record)
+    return [
+        *head,
+        *(line for block in blocks for line in ("", *block)),
+    ], not problems and record.valid_poses > 0
+
+
+def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:
+    """Return stations, IMU and recording of a master's status, and what requires action, the most urgent first."""
+    blocks, problems = [], []
     for station in record.stations:
-        label, station_ok = station_label(station)
-        lines += ["", _headline(f"STATION {station.id}  {label}", ok=station_ok), *_station_lines(station)]
-        ok = ok and station_ok
+        label, ok = station_label(station)
+        blocks.append([_headline(f"STATION {station.id}  {label}", ok=ok), *_station_lines(station)])
+        problems += [] if ok else [f"station {station.id}: {label}"]
     if record.imu is not None:
-        label, imu_ok = imu_label(record.imu)
-        lines += ["", _headline(f"IMU  {label}", ok=imu_ok), *_imu_lines(record.imu)]
-        ok = ok and imu_ok
+        label, ok = imu_label(record.imu)
+        blocks.append([_headline(f"IMU  {label}", ok=ok), *_imu_lines(record.imu)])
+        problems += [] if ok else [f"IMU: {label}"]
     if record.recording is not None:
-        recording_lines, recording_ok = _recording_lines(record.recording, record.disk, record.stamp_ns)
-        lines += ["", *recording_lines]
-        ok = ok and recording_ok
-    return lines, ok
+        block, ok = _recording_block(record.recording, record.disk, record.stamp_ns)
+        blocks.append(block)
+        problems += [] if ok else ["the disk of the recording fails"]
+    return blocks, problems
 
 
-def _recording_lines(
-    recording: RecordingStatus, disk: DiskStatus | None, now_ns: int
-) -> tuple[list[str], bool]:
-    ok = recording_ok(recording, now_ns)
+def _recording_block(recording: RecordingStatus, disk: DiskStatus | None, now_ns: int) -> tuple[Block, bool]:
+    ok = _recording_ok(recording, now_ns)
     lines = [_headline(f"RECORDING  {'OK' if ok else 'DISK FAILS'}", ok=ok)]
-    lines += _wrapped(recording.file, "  ")
-    space = "" if disk is None else f", disk {size_text(disk.free_bytes)} free"
-    lines.append(f"  {size_text(recording.bytes)}{space}")
+    lines += wrapped(recording.file, "  ")
+    space = "" if disk is None else f", disk {_size_text(disk.free_bytes)} free"
+    lines.append(f"  {_size_text(recording.bytes)}{space}")
     if not ok:
         lines.append(f"  {recording.waiting_lines} lines not written yet")
     if recording.lost_lines:
@@ -128,15 +98,14 @@ def _recording_lines(
     return lines, ok
 
 
-def recording_ok(recording: RecordingStatus, now_ns: int) -> bool:
-    """Return whether all lines are written, or the last ones were just now."""
+def _recording_ok(recording: RecordingStatus, now_ns: int) -> bool:
     written_ns = recording.last_write_ns
     return recording.waiting_lines == 0 or (
         written_ns is not None and now_ns - written_ns < MAX_WRITE_AGE_S * 1e9
     )
 
 
-def size_text(size: int) -> str:
+def _size_text(size: int) -> str:
     """Return a size in MB or GB."""
     return f"{size / 1e6:.1f} MB" if size < 1_000_000_000 else f"{size / 1e9:.1f} GB"
 
@@ -159,7 +128,7 @@ def imu_label(imu: ImuStatus) -> tuple[str, bool]:
 def _imu_lines(imu: ImuStatus) -> list[str]:
     rate = "" if imu.rate_hz is None else f"{imu.rate_hz:.1f} Hz  "
     age = "" if imu.age_s is None else f"last {duration(imu.age_s)}"
-    lines = [*_wrapped(imu.device, "  "), f"  {rate}{age}".rstrip()]
+    lines = [*wrapped(imu.device, "  "), f"  {rate}{age}".rstrip()]
     if imu.gaps:
         lines.append(f"  {imu.gaps} gaps, {imu.lost} samples lost")
     if imu.saturated:
@@ -173,7 +142,7 @@ def _imu_lines(imu: ImuStatus) -> list[str]:
         x, y, z = (1e3 * each for each in imu.accelerometer_bias_mps2)
         lines.append(f"  acc. bias {x:+.0f} {y:+.0f} {z:+.0f} mm/s^2")
     for text in (imu.problem, imu.disagreement):
-        lines += _wrapped(text, "  ")
+        lines += wrapped(text, "  ")
     return [line for line in lines if line.strip()]
 
 
@@ -223,14 +192,14 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
     problems = _client_problems(record)
     lines = [_headline(f"STATION {record.station}  {problems[0] if problems else 'OK'}", ok=not problems)]
     lines += [_headline(problem, ok=False) for problem in problems[1:]]
-    lines += [_headline(part, ok=False) for part in _wrapped(record.problem)]
+    lines += [_headline(part, ok=False) for part in wrapped(record.problem)]
     lines += ["", *_instrument_lines(record)]
     if record.mode == "direct":
         lines.append("direct: single measurements")
     elif record.instrument is not None:
         lines.append(f"tracking prism {record.prism}, {record.rate_hz:.2f} Hz")
     if not lines[-1].startswith(record.activity):
-        lines += _wrapped(record.activity, "  ")
+        lines += wrapped(record.activity, "  ")
     if (last := record.last) is not None:
         distance = "no distance" if last.slope_distance_m is None else f"{last.slope_distance_m:.4f} m"
         lines += [
@@ -257,7 +226,7 @@ def client_text(record: ClientStatus) -> tuple[list[str], bool]:
 
 
 def _instrument_lines(record: ClientStatus) -> list[str]:
-    lines = _wrapped(record.instrument or "no instrument")
+    lines = wrapped(record.instrument or "no instrument")
     if record.battery_percent is not None:
         lines.append(f"  battery {record.battery_percent} %")
     if (settings := record.settings) is not None:
@@ -278,7 +247,7 @@ def setting_lines(settings: InstrumentRecord) -> list[str]:
     return lines
 
 
-def _wrapped(text: str, indent: str = "") -> list[str]:
+def wrapped(text: str, indent: str = "") -> list[str]:
     """Wrap a text from outside and remove its control characters."""
     lines = textwrap.wrap(
         text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
@@ -343,40 +312,3 @@ def duration(seconds: float) -> str:
 def _headline(text: str, *, ok: bool) -> str:
     """Style a headline, reversed if action is required; click removes the style without a terminal."""
     return click.style(text, bold=True, reverse=not ok)
-
-
-def _request(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, bytes]:
-    """Read the status from the given socket, else from the default of a master, then of a client."""
-    if socket_path is not None:
-        return status_of(socket_path)
-    for path in (DEFAULT_SOCKET, DEFAULT_CLIENT_SOCKET):
-        with contextlib.suppress(StreamError):
-            return status_of(path)
-    raise StreamError(
-        f"no daemon runs here: neither {DEFAULT_SOCKET} nor {DEFAULT_CLIENT_SOCKET} responds; "
-        "start tsgt-master or tsgt-client, or give --socket"
-    )
-
-
-def status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
-    """Wait for the first status line on a socket."""
-    until_s = time.monotonic() + TIMEOUT_S  # for the status, not for each line
-    try:
-        with connect(path, TIMEOUT_S) as reader:
-            while line := reader.line(until_s):
-                match decode(Typed, line).type:
-                    case "status":
-                        return decode(StatusRecord, line), line
-                    case "client_status":
-                        return decode(ClientStatus, line), line
-                    case "hello":
-                        decode(HelloRecord, line)
-    except TimeoutError as error:
-        raise StreamError(
-            f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
-        ) from error
-    except OSError as error:
-        raise StreamError(f"{path}: no connection to a daemon ({error.strerror or error})") from error
-    except ValueError as error:
-        raise StreamError(f"{path}: not a stream of tsgt ({error})") from error
-    raise StreamError(f"{path}: the stream ended without a status; is it a replay?")

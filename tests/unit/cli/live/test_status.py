@@ -12,7 +12,7 @@ import click
 import pytest
 from harness.records import IMU_STATUS
 
-from tsgt.cli.status import client_text, duration, master_text, station_label
+from tsgt.cli.live.status_text import client_text, duration, master_text, station_label
 from tsgt.model import Status
 from tsgt.recording import DiskStatus, HelloRecord, RecordingStatus, StationStatus, StatusRecord, encode_line
 from tsgt.recording.journal import InstrumentRecord
@@ -378,7 +378,7 @@ def test_missing_socket_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
 
 def test_stream_without_status_times_out(tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The timeout applies to the status, not to each line."""
-    monkeypatch.setattr("tsgt.cli.status.TIMEOUT_S", 0.2)
+    monkeypatch.setattr("tsgt.cli.live.status.TIMEOUT_S", 0.2)
     path = tmp_path / "a.sock"
     over = threading.Event()
 

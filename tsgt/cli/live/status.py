@@ -1,0 +1,137 @@
+"""The command ``tsgt status``: the state of the daemon on this machine, once or continuously."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import click
+
+from tsgt.cli.live.follower import StreamFollower
+from tsgt.cli.live.line_reader import connect
+from tsgt.cli.live.status_text import client_text, master_text
+from tsgt.cli.live.watch import Watch
+from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, DEFAULT_SOCKET, path_type
+from tsgt.cli.output import CHECK_FAILED, printable
+from tsgt.cli.render import clock_time, render
+from tsgt.errors import StreamError
+from tsgt.recording import HelloRecord, StatusRecord, Typed, decode
+from tsgt.station import ClientStatus
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+TIMEOUT_S = 5.0
+"""A master sends its status each second; one that sends none for this long is stuck."""
+
+
+@click.command()
+@click.option(
+    "--socket",
+    "socket_path",
+    type=path_type,
+    envvar="TSGT_SOCKET",
+    show_envvar=True,
+    help=f"Socket of a master or a client.  [default: {DEFAULT_SOCKET}, else {DEFAULT_CLIENT_SOCKET}]",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the status record as received.")
+@click.option(
+    "--watch",
+    is_flag=True,
+    help="Show a screen that is updated in place until Ctrl-C; without a terminal, or with --json, a line per status.",
+)
+def status(socket_path: Path | None, *, as_json: bool, watch: bool) -> int:
+    """Show the status of the daemon on this machine.
+
+    A master reports all its stations, a client its own station. With --watch also the verdict, the pose and the last
+    events; it connects again when the daemon was restarted.
+
+    Exit code 1: no daemon runs. 3: a daemon runs, but action is required: a station is not received or does not track,
+    the IMU gives no samples or disagrees with the prisms, the disk fails, or no pose is valid. With --watch always 0.
+    """
+    if watch:
+        paths = [DEFAULT_SOCKET, DEFAULT_CLIENT_SOCKET] if socket_path is None else [socket_path]
+        with contextlib.closing(StreamFollower(paths)) as follower:
+            if as_json or not sys.stdout.isatty():
+                _print_lines(follower, as_json=as_json)
+            else:
+                _show_screen(follower)
+        return 0
+    record, line = _request(socket_path)
+    text, ok = client_text(record) if isinstance(record, ClientStatus) else master_text(record)
+    click.echo(line.rstrip() if as_json else "\n".join(text))
+    return 0 if ok else CHECK_FAILED
+
+
+def _show_screen(follower: StreamFollower) -> None:
+    from tsgt.cli.live.screen import REFRESH_S, screen
+
+    watch = Watch()
+    with screen() as show:
+        while True:
+            for line in follower.lines(time.monotonic() + REFRESH_S):
+                with contextlib.suppress(ValueError):  # of a newer version; `tsgt listen` reports it
+                    watch.take(line, time.monotonic())
+            width = shutil.get_terminal_size().columns
+            show(*watch.view(time.monotonic(), follower.problem, width=width), list(watch.events))
+
+
+def _print_lines(follower: StreamFollower, *, as_json: bool) -> None:
+    """Print a line per status, and on stderr the loss of the connection."""
+    problem = ""
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            for line in follower.lines(time.monotonic() + TIMEOUT_S):
+                kind = decode(Typed, line).type
+                if kind in ("status", "client_status"):
+                    click.echo(line.rstrip() if as_json else _text_line(kind, line))
+            if follower.problem not in (problem, ""):
+                click.echo(f"warning: {follower.problem}; connecting again", err=True)
+            problem = follower.problem
+
+
+def _text_line(kind: str, line: bytes) -> str:
+    if kind == "client_status":
+        record = decode(ClientStatus, line)
+        return f"{clock_time(record.stamp_ns)}  status  {click.unstyle(client_text(record)[0][0])}"
+    return printable(render(kind, line) or "")
+
+
+def _request(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, bytes]:
+    """Read the status from the given socket, else from the default of a master, then of a client."""
+    if socket_path is not None:
+        return status_of(socket_path)
+    for path in (DEFAULT_SOCKET, DEFAULT_CLIENT_SOCKET):
+        with contextlib.suppress(StreamError):
+            return status_of(path)
+    raise StreamError(
+        f"no daemon runs here: neither {DEFAULT_SOCKET} nor {DEFAULT_CLIENT_SOCKET} responds; "
+        "start tsgt-master or tsgt-client, or give --socket"
+    )
+
+
+def status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
+    """Wait for the first status line on a socket."""
+    until_s = time.monotonic() + TIMEOUT_S  # for the status, not for each line
+    try:
+        with connect(path, TIMEOUT_S) as reader:
+            while line := reader.line(until_s):
+                match decode(Typed, line).type:
+                    case "status":
+                        return decode(StatusRecord, line), line
+                    case "client_status":
+                        return decode(ClientStatus, line), line
+                    case "hello":
+                        decode(HelloRecord, line)
+    except TimeoutError as error:
+        raise StreamError(
+            f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
+        ) from error
+    except OSError as error:
+        raise StreamError(f"{path}: no connection to a daemon ({error.strerror or error})") from error
+    except ValueError as error:
+        raise StreamError(f"{path}: not a stream of tsgt ({error})") from error
+    raise StreamError(f"{path}: the stream ended without a status; is it a replay?")

@@ -27,6 +27,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "status": ("live.status:status", "Show the status of the daemon on this machine."),
         "listen": ("live.listen:listen", "Print the pose stream as text."),
         "relay": ("relay:relay", "Serve the pose stream to other computers."),
+        "web": ("web:web", "Serve the operator's page to browsers."),
         "imu": ("imu:imu", "Read an IMU for the master."),
         "atmosphere": ("atmosphere:atmosphere", "Set temperature and pressure of the instrument."),
     },

@@ -91,10 +91,10 @@ class Tab:
             await asyncio.sleep(POLL_S)
         return loop.time() - start_s
 
-    async def screenshot(self, path: Path) -> None:
-        """Write what the window shows as a PNG."""
+    async def screenshot(self) -> bytes:
+        """Return what the window shows as a PNG."""
         result = await self.call("Page.captureScreenshot", format="png")
-        path.write_bytes(base64.b64decode(result["data"]))
+        return base64.b64decode(result["data"])
 
     async def _read(self) -> None:
         async for message in self._socket:
@@ -153,7 +153,11 @@ async def browser() -> AsyncIterator[Browser]:
 async def _port(file: Path) -> str:
     async with asyncio.timeout(START_TIMEOUT_S):
         while True:
-            found = re.match(r"(\d+)\n", file.read_text()) if file.exists() else None
-            if found is not None:
-                return found[1]
+            if found := _number(file):
+                return found
             await asyncio.sleep(POLL_S)
+
+
+def _number(file: Path) -> str:
+    found = re.match(r"(\d+)\n", file.read_text()) if file.exists() else None
+    return found[1] if found is not None else ""

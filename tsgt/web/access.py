@@ -22,7 +22,7 @@ ATTEMPTS = 30
 """Wrong codes within the span, from one address and from all. Guessing a code of eight letters and digits at this pace
 takes ten thousand years."""
 
-_KEY_ITERATIONS = 200_000
+KEY_ITERATIONS = 200_000
 _NONCE_BYTES = 16
 
 
@@ -87,7 +87,7 @@ class Access:
     def __init__(self, code: str) -> None:
         self._code = hashlib.sha256(code.encode()).digest()
         # Slow on purpose: whoever has got hold of a cookie must not find the code by trying.
-        self._key = hashlib.pbkdf2_hmac("sha256", code.encode(), b"tsgt web cookie", _KEY_ITERATIONS)
+        self._key = hashlib.pbkdf2_hmac("sha256", code.encode(), b"tsgt web cookie", KEY_ITERATIONS)
         self._failures: deque[tuple[float, str]] = deque(maxlen=ATTEMPTS)
 
     def cookie(self) -> str:

@@ -226,16 +226,32 @@ class Page:
         await response.prepare(request)
         with suppress(ConnectionError):
             async with aclosing(self.messages.messages(request.query)) as messages:
-                async for message in messages:
-                    try:
-                        async with asyncio.timeout(WRITE_TIMEOUT_S):
-                            await response.write(b"data: " + message + b"\n\n")
-                    except TimeoutError:
-                        log.warning("web_reader_stalled", address=request.remote)
-                        break
+                if not await self._send(request, response, messages):
+                    log.warning("web_reader_stalled", address=request.remote)
         if request.transport is not None:
             request.transport.abort()
         return response
+
+    async def _send(
+        self, request: web.Request, response: web.StreamResponse, messages: AsyncGenerator[bytes]
+    ) -> bool:
+        """Send messages to their end; False: the browser has stalled."""
+        unsent_since_ns: int | None = None
+        async for message in messages:
+            try:
+                # It waits only now and then, so what is unsent is looked at below.
+                async with asyncio.timeout(WRITE_TIMEOUT_S):
+                    await response.write(b"data: " + message + b"\n\n")
+            except TimeoutError:
+                return False
+            now_ns = self.clock.monotonic_ns()
+            if request.transport is None or request.transport.get_write_buffer_size() == 0:
+                unsent_since_ns = None
+            elif unsent_since_ns is None:
+                unsent_since_ns = now_ns
+            elif now_ns - unsent_since_ns > WRITE_TIMEOUT_S * 1e9:
+                return False
+        return True
 
 
 def _protect(response: web.StreamResponse) -> None:

@@ -1,0 +1,196 @@
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from harness.records import SETUP, START, measurement
+from harness.web import feed, mission, pose, station, status
+
+from tsgt.model import ReferencePoint, Status
+from tsgt.recording import EventRecord, SetupRecord, StationShare, encode_line
+from tsgt.web.messages import encode, message
+from tsgt.web.state import MissionState
+
+LEFT = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+"""A quarter turn about the z axis."""
+
+
+def event(name: str, message: str) -> EventRecord:
+    """Return an event."""
+    return EventRecord(stamp_ns=START, event=name, message=message)
+
+
+def verdict(state: MissionState, now_s: float) -> tuple[str, str]:
+    """Return the words and the cause that the page shows."""
+    shown = state.view(now_s)["verdict"]
+    return shown["words"], shown["cause"]
+
+
+def running(setup: SetupRecord = SETUP) -> MissionState:
+    """Return the state of a mission in which all is well, at 10 s."""
+    state = mission(setup)
+    feed(state, status(10.0), pose(10.0), now_s=10.0)
+    return state
+
+
+def test_all_is_well() -> None:
+    """Stations track, the pose is valid, the stream flows."""
+    assert verdict(running(), 10.1) == ("GOOD", "all stations track, the pose is valid")
+
+
+def test_silent_master_is_no_green() -> None:
+    """1.5 s after the last line at the latest, and at once when the stream ends."""
+    state = running()
+    assert verdict(state, 11.6)[0] == "STREAM STOPPED"
+    state = running()
+    state.disconnected("the stream has ended")
+    assert verdict(state, 10.1) == ("STREAM STOPPED", "the stream has ended")
+
+
+def test_stream_without_poses_is_no_green() -> None:
+    """A status each second does not make an old pose a live one."""
+    state = running()
+    feed(state, status(11.2), now_s=11.2)
+    assert verdict(state, 11.3)[0] == "NO POSE"
+
+
+def test_late_lines_are_no_live_view() -> None:
+    """Lines that have waited on their way look like those of now; their stamps say otherwise."""
+    state = running()
+    feed(state, status(10.5), pose(10.5), now_s=13.5)
+    assert verdict(state, 13.5) == ("STREAM STOPPED", "the stream arrives 3 s late")
+
+
+def test_connection_made_anew_knows_nothing_of_before() -> None:
+    """The pose from before is not shown as one of now."""
+    state = running()
+    state.disconnected("gone")
+    state.connected(11.0)
+    view = state.view(11.1)
+    assert (view["verdict"]["words"], view["pose"], view["stations"]) == ("NO POSE", None, [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"last_heard_s": None}, "station 2: not received yet"),
+        ({"last_heard_s": 7.0, "answering": False}, "station 2: silent for 7 s"),
+        ({"status": Status.NO_TARGET}, "station 2: no prism"),
+        ({"status": Status.TILT}, "station 2: not level"),
+        ({"age_s": 9.0}, "station 2: no new measurement for 9 s"),
+    ],
+)
+def test_station_that_needs_the_operator_is_named(changes: dict[str, Any], cause: str) -> None:
+    """The pose is still valid: care."""
+    state = mission()
+    feed(state, status(10.0, station(1), station(2, **changes), station(3)), pose(10.0), now_s=10.0)
+    assert verdict(state, 10.1) == ("CARE", cause)
+
+
+def test_all_stations_silent_is_the_radio() -> None:
+    """One cause instead of three."""
+    state = mission()
+    silent = [station(number, last_heard_s=6.0, answering=False) for number in (1, 2, 3)]
+    feed(state, status(10.0, *silent), pose(10.0), now_s=10.0)
+    assert verdict(state, 10.1) == ("CARE", "no station is received: the master's radio?")
+
+
+def test_missing_prism_is_explained_with_what_its_station_does() -> None:
+    """The reason of an invalid pose, for people."""
+    state = mission()
+    shares = (
+        StationShare(id=1, prism=1, age_s=0.3, residual_m=None, reason=""),
+        StationShare(id=2, prism=2, age_s=4.2, residual_m=None, reason="outage"),
+    )
+    lost = pose(10.0, valid=False, reason="outage", quality="invalid", position_m=None, orientation_xyzw=None,
+                covariance=None, stations=shares)  # fmt: skip
+    feed(state, status(10.0, station(1), station(2, status=Status.NO_TARGET)), lost, now_s=10.0)
+    assert verdict(state, 10.1) == ("NO POSE", "station 2 has not measured prism 2 for 4 s (no prism)")
+    assert state.view(10.1)["pose"] is None
+
+
+def test_robot_outside_its_fence_is_urgent() -> None:
+    """By its position, also when it left before this program started."""
+    state = mission()
+    feed(state, status(10.0), pose(10.0, position_m=(60.0, 60.0, 0.0)), now_s=10.0)
+    shown = state.view(10.1)["verdict"]
+    assert (shown["words"], shown["cause"], shown["urgent"]) == ("CARE", "outside the geofence site", True)
+
+
+def test_event_of_the_fence_lasts_until_the_robot_is_back() -> None:
+    """The master's fence counts uncertainty and lost poses, which a position alone does not tell."""
+    state = running()
+    feed(state, event("geofence_exited", "geofence site exited: no valid pose for 2 s"), now_s=10.1)
+    assert verdict(state, 10.2) == ("CARE", "outside the geofence site")
+    feed(state, event("geofence_entered", "geofence site entered: the robot is 3 m within"), now_s=10.3)
+    feed(state, pose(11.2), now_s=11.2)
+    assert verdict(state, 11.3)[0] == "GOOD"
+
+
+def test_heading_and_prisms_are_those_of_the_robot() -> None:
+    """Not of a reference point that is turned against it: a camera that looks to the left of the robot."""
+    camera = ReferencePoint(name="camera", position_m=(1.0, 0.0, 0.0), orientation_xyzw=LEFT)
+    state = running(replace(SETUP, reference_point=camera, child_frame="camera"))
+    # The camera looks along +y, so the robot drives along +x; its origin is a metre behind the camera.
+    feed(state, pose(11.0, orientation_xyzw=LEFT), now_s=11.0)
+    shown = state.view(11.0)["pose"]
+    assert shown["heading_rad"] == pytest.approx(0.0, abs=1e-3)
+    assert shown["prisms"][1] == pytest.approx([8.5, 10.0])
+
+
+def test_sight_line_ends_where_the_station_measured() -> None:
+    """By the convention of angles: horizontal ones run clockwise, from the x axis."""
+    state = running()
+    seen = replace(
+        measurement(0), horizontal_angle_rad=math.pi / 2, zenith_angle_rad=math.pi / 2, slope_distance_m=20.0
+    )
+    feed(state, seen, now_s=10.1)
+    tile = state.view(10.2)["stations"][0]
+    assert (tile["sight"], tile["range_m"]) == ([pytest.approx(0.0, abs=1e-9), -20.0], 20.0)
+
+
+def test_script_in_texts_stays_text_and_short() -> None:
+    """Of an event: it is passed on as one line of bounded length, in JSON."""
+    state = running()
+    feed(state, event("</script>", "<script>alert(1)</script>\n\x1b[2J" + "x" * 900), now_s=10.1)
+    sent = encode(message(state, state.view(10.2), None, 10.2))
+    shown = json.loads(sent)["events"]["items"][0]
+    assert b"\n" not in sent
+    assert shown["text"].startswith("<script>alert(1)</script>  [2J")
+    assert len(shown["text"]) == 300
+
+
+def test_histories_are_sent_once() -> None:
+    """A reader gets everything at first and then what is new; the set-up when it changes."""
+    state = running()
+    first = message(state, {}, None, 10.0)
+    cursors = state.cursors()
+    feed(state, pose(10.5, position_m=(11.0, 10.0, 0.0)), now_s=10.5)
+    then = message(state, {}, cursors, 10.5)
+    assert first["trail"]["items"] == [[10.0, 10.0]]
+    assert then["trail"] == {"first": 1, "items": [[11.0, 10.0]]}
+    assert ("setup" in first, "setup" in then) == (True, False)
+    feed(state, SETUP, now_s=10.6)
+    assert "setup" in message(state, {}, cursors, 10.6)
+
+
+def test_poses_are_decoded_no_more_often_than_shown() -> None:
+    """At 100 Hz most are only counted; one that becomes invalid is seen at once."""
+    state = running()
+    lines = [encode_line(pose(10 + i / 100, position_m=(10.0 + i, 10.0, 0.0))) for i in range(1, 6)]
+    for i, line in enumerate(lines):
+        state.line(line, 10.0 + (i + 1) / 100)
+    assert state.view(10.06)["pose"]["at"][0] == 10.0
+    feed(state, pose(10.06, valid=False, reason="tilt", quality="invalid"), now_s=10.06)
+    assert verdict(state, 10.07)[0] == "NO POSE"
+
+
+def test_other_protocol_is_refused() -> None:
+    """Fields may have another meaning."""
+    with pytest.raises(ValueError, match="protocol version 2"):
+        MissionState("s").line(
+            b'{"type":"hello","protocol":2,"version":"9","capabilities":[],"limits":null}', 0.0
+        )

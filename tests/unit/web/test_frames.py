@@ -11,7 +11,7 @@ def test_rotations_are_those_of_scipy() -> None:
     """Rotation of a vector, product, inverse."""
     a, b = Rotation.random(2, rng=np.random.default_rng(1))
     v = (1.0, -2.0, 0.5)
-    qa, qb = tuple(a.as_quat()), tuple(b.as_quat())
+    qa, qb = ((float(x), float(y), float(z), float(w)) for x, y, z, w in (a.as_quat(), b.as_quat()))
     assert np.allclose(frames.rotate(qa, v), a.apply(v))
     assert np.allclose(frames.rotate(frames.product(qa, qb), v), (a * b).apply(v))
     assert np.allclose(frames.rotate(frames.inverse(qa), v), a.inv().apply(v))

@@ -13,10 +13,26 @@ from tsgt.web.verdict import Finding, Level
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from tsgt.recording import EventRecord, PoseRecord, SetupRecord, StatusRecord, ValidityLimits
+    from tsgt.recording import (
+        EventRecord,
+        PoseRecord,
+        RecordingStatus,
+        SetupRecord,
+        StatusRecord,
+        ValidityLimits,
+    )
     from tsgt.web.stations import Condition
 
 MAX_IMU_AGE_S = 1.0
+
+MAX_WRITE_AGE_S = 5.0
+MAX_WAITING_LINES = 600
+"""The master records some lines a second at least, and some sixty with poses: these are ten seconds of them."""
+
+LOW_DISK_BYTES = 500_000_000
+"""An hour and more of recording."""
+
+FULL_DISK_BYTES = 50_000_000
 
 ALARMS = frozenset(
     {
@@ -241,11 +257,64 @@ def radio_view(status: StatusRecord | None, setup: SetupRecord | None) -> dict[s
     }
 
 
-def storage_view(_status: StatusRecord | None, setup: SetupRecord | None) -> dict[str, Any]:
+def storage_view(status: StatusRecord | None, setup: SetupRecord | None) -> dict[str, Any]:
     """Return recording and disk."""
-    return {"recording": {"file": setup.recording} if setup is not None else None, "disk": None}
+    recording = status.recording if status is not None else None
+    disk = status.disk if status is not None else None
+    return {
+        "recording": {"file": setup.recording if setup is not None else None}
+        if status is None or recording is None
+        else {
+            "file": recording.file,
+            "bytes": recording.bytes,
+            "write_age_s": None
+            if recording.last_write_ns is None
+            else round((status.stamp_ns - recording.last_write_ns) / 1e9, 1),
+            "bad": bool(_recording_findings(status.stamp_ns, recording)),
+        },
+        "disk": None
+        if disk is None
+        else {
+            "free_bytes": disk.free_bytes,
+            "total_bytes": disk.total_bytes,
+            "bad": disk.free_bytes < LOW_DISK_BYTES,
+        },
+    }
 
 
-def storage_findings(_status: StatusRecord | None) -> list[Finding]:
+def storage_findings(status: StatusRecord | None) -> list[Finding]:
     """Return what is wrong with recording and disk."""
-    return []
+    if status is None:
+        return []
+    found = [] if status.recording is None else _recording_findings(status.stamp_ns, status.recording)
+    if status.disk is not None and status.disk.free_bytes < LOW_DISK_BYTES:
+        free = status.disk.free_bytes
+        full = free < FULL_DISK_BYTES
+        found.append(
+            Finding(
+                Level.CARE,
+                f"the disk is {'full' if full else 'nearly full'}: {free / 1e6:.0f} MB left",
+                urgent=full,
+            )
+        )
+    return found
+
+
+def _recording_findings(now_ns: int, recording: RecordingStatus) -> list[Finding]:
+    found = []
+    since_s = 0.0 if recording.last_write_ns is None else (now_ns - recording.last_write_ns) / 1e9
+    if since_s > MAX_WRITE_AGE_S:
+        found.append(Finding(Level.CARE, f"nothing has been recorded for {since_s:.0f} s", urgent=True))
+    elif recording.waiting_lines > MAX_WAITING_LINES:
+        found.append(
+            Finding(
+                Level.CARE,
+                f"the disk is slow: {recording.waiting_lines} lines wait to be recorded",
+                urgent=True,
+            )
+        )
+    if recording.lost_lines:
+        found.append(
+            Finding(Level.CARE, f"{recording.lost_lines} lines of the recording are lost", urgent=True)
+        )
+    return found

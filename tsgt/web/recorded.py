@@ -18,6 +18,7 @@ from tsgt.recording import (
     encode_line,
     read_lines,
 )
+from tsgt.web.mission_findings import kind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -111,8 +112,8 @@ class RecordingIndex:
                 yield timeline.advance(line), line
 
     def marks(self) -> list[tuple[float, str]]:
-        """Return time and name of each event, for the time bar."""
-        return [(round(at_s, 1), decode(EventRecord, line).event) for at_s, line in self.events]
+        """Return time and kind of each event, for the time bar."""
+        return [(round(at_s, 1), kind(decode(EventRecord, line).event)) for at_s, line in self.events]
 
     def _add(self, line: bytes, at_s: float, unix_ns: int | None) -> None:
         if self.start_ns is None:

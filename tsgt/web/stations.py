@@ -112,6 +112,9 @@ def tile(
         "rssi_dbm": rounded(station.rssi_dbm, 0),
         "snr_db": rounded(station.snr_db, 0),
         "loss": rounded(station.loss, 2),
+        "battery_percent": station.battery_percent,
+        "air_ppm": rounded(station.atmospheric_ppm, 1),
+        "check_s": rounded(station.last_target_check_age_s, 0),
         "age_s": None if station.age_s is None else rounded(station.age_s + elapsed_s, 1),
         "heard_s": None if station.last_heard_s is None else rounded(station.last_heard_s + elapsed_s, 1),
         "sight": [rounded(each, 2) for each in newest.point_m[:2]]

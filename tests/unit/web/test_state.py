@@ -10,7 +10,7 @@ from harness.records import SETUP, START, measurement
 from harness.web import feed, mission, pose, station, status
 
 from tsgt.model import ReferencePoint, Status
-from tsgt.recording import EventRecord, SetupRecord, StationShare, encode_line
+from tsgt.recording import DiskStatus, EventRecord, RecordingStatus, SetupRecord, StationShare, encode_line
 from tsgt.web.messages import encode, message
 from tsgt.web.state import MissionState
 
@@ -128,6 +128,36 @@ def test_event_of_the_fence_lasts_until_the_robot_is_back() -> None:
     feed(state, event("geofence_entered", "geofence site entered: the robot is 3 m within"), now_s=10.3)
     feed(state, pose(11.2), now_s=11.2)
     assert verdict(state, 11.3)[0] == "GOOD"
+
+
+@pytest.mark.parametrize(
+    ("recording", "disk", "cause"),
+    [
+        ({}, DiskStatus(free_bytes=20_000_000, total_bytes=10**10), "the disk is full: 20 MB left"),
+        ({}, DiskStatus(free_bytes=400_000_000, total_bytes=10**10), "the disk is nearly full: 400 MB left"),
+        ({"last_write_ns": START + 4 * 10**9}, None, "nothing has been recorded for 6 s"),
+        ({"waiting_lines": 700}, None, "the disk is slow: 700 lines wait to be recorded"),
+        ({"lost_lines": 3}, None, "3 lines of the recording are lost"),
+        ({}, DiskStatus(free_bytes=10**9, total_bytes=10**10), ""),
+    ],
+)
+def test_trouble_with_the_recording_is_told(
+    recording: dict[str, int], disk: DiskStatus | None, cause: str
+) -> None:
+    """Before the field day is lost."""
+    good = {
+        "file": "r.jsonl",
+        "bytes": 1000,
+        "last_write_ns": START + 10**10,
+        "waiting_lines": 3,
+        "lost_lines": 0,
+    }
+    state = mission()
+    record = RecordingStatus(**(good | recording))  # type: ignore[arg-type]
+    feed(state, status(10.0, recording=record, disk=disk), pose(10.0), now_s=10.0)
+    assert verdict(state, 10.1) == (
+        ("CARE", cause) if cause else ("GOOD", "all stations track, the pose is valid")
+    )
 
 
 def test_heading_and_prisms_are_those_of_the_robot() -> None:

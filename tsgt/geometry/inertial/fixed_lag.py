@@ -23,6 +23,7 @@ from tsgt.geometry.inertial.factors import (
 )
 from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
+from tsgt.geometry.inertial.odometry import Odometry, OdometrySamples
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
@@ -39,7 +40,7 @@ from tsgt.geometry.inertial.solver import (
     inertial_knot_times,
     solve_inertial,
 )
-from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, Gravity, InertialStates, Mounting
 from tsgt.geometry.rigid import dot
 from tsgt.geometry.trajectory.gauss_newton import (
     MAX_ITERATIONS,
@@ -68,7 +69,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
-    from tsgt.model import ImuParameters, MotionPrior
+    from tsgt.model import ImuParameters, MotionPrior, OdometryParameters
 
 SEARCH_S = 40.0  # Longest stretch of measurements that the search over headings takes
 SEARCH_GROWTH = (
@@ -106,11 +107,17 @@ class InertialFixedLagSmoother(MeasurementWindow):
         reference_m: FloatArray,
         setup_jacobian: SetupJacobian | None = None,
         gyro_only: bool = False,
+        odometry: OdometryParameters | None = None,
     ) -> None:
         super().__init__(InnovationMonitor(CONSISTENT_ALONE))
         self._noise = estimation_noise(imu.noise)
         mounting = Mounting.of(imu, reference_m)
         self._mounting = replace(mounting, position=np.zeros(3)) if gyro_only else mounting
+        self._odometry = (
+            None
+            if odometry is None
+            else Odometry.of(OdometrySamples.none(), odometry, self._mounting, reference_m)
+        )
         self._prior, self._gyro_only = prior, prior if gyro_only else None
         self._initial_gravity = self._gravity = Gravity.of(imu)
         self._health = HealthMonitor(imu)
@@ -179,6 +186,18 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if self._predictor is not None:
             self._predictor.discard_after(from_s)
 
+    def add_odometry(self, new: OdometrySamples) -> None:
+        """Add samples of the wheel odometry, in the order of time; they may precede others that were added before."""
+        if self._odometry is None or not len(new):
+            return
+        joined = self._odometry.samples.joined(new)
+        self._odometry = replace(self._odometry, samples=joined)
+        previous = int(np.searchsorted(joined.end_s, new.end_s[0])) - 1
+        from_s = float(joined.end_s[previous]) if previous >= 0 else -np.inf
+        self._stale_from_s = min(self._stale_from_s, from_s)
+        if self._predictor is not None:
+            self._predictor.discard_after(from_s)
+
     def marginalise_before(self, before_s: float) -> None:
         """Marginalise the states before a time; states from then on can still be queried."""
         super().marginalise_before(before_s)
@@ -198,6 +217,10 @@ class InertialFixedLagSmoother(MeasurementWindow):
             first = int(np.searchsorted(self._samples.end_s, from_s - SAMPLES_MARGIN_S))
             # The last one, however old: missing ones are filled in from there.
             self._samples = self._samples.select(slice(max(min(first, len(self._samples) - 1), 0), None))
+            if self._odometry is not None:
+                driven = self._odometry.samples
+                driven = driven.select(driven.end_s > from_s - SAMPLES_MARGIN_S)
+                self._odometry = replace(self._odometry, samples=driven)
 
     def predict(self, time_s: float, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all so far, and the (1, 6, 6) covariance of its pose.
@@ -214,7 +237,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
     def _predict(self, time_s: float, dim: int) -> tuple[States, FloatArray]:
         assert self._predictor is not None  # noqa: S101 (only called while initialised)
         assert self._samples is not None  # noqa: S101 (initialised)
-        state, covariance = self._predictor.at(time_s, self._samples)
+        state, covariance = self._predictor.at(time_s, self._samples, self._odometry)
         return state, covariance[:, :dim, :dim] * self._prediction_scale()
 
     def trajectory(self) -> WindowTrajectory:
@@ -223,15 +246,18 @@ class InertialFixedLagSmoother(MeasurementWindow):
             assert self._solved is not None  # noqa: S101 (only called while initialised)
             window, gravity, factor, _ = self._solved
             displacement = self._window_displacement()
+            covariance, cross_covariance = factor.marginals()
+            motion = slice(INERTIAL_STATE_DIM)
             self._trajectory = WindowTrajectory(
                 InertialTrajectory(
                     window.knots,
                     gravity,
                     window.samples,
                     self._mounting,
-                    *factor.marginals(),
+                    covariance[:, motion, motion],
+                    cross_covariance[:, motion, motion],
                     self._gyro_only,
-                    None if displacement is None else displacement[0],
+                    None if displacement is None else displacement[0][:, motion],
                 ),
                 self._predict,
                 self._predicted_common,
@@ -257,7 +283,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         displacement = self._window_displacement()
         assert displacement is not None  # noqa: S101 (only called where the set-up is uncertain)
         newest = np.concatenate([displacement[0][-1], displacement[1]])
-        displaced = self._predictor.by_start(time_s, self._samples)[:dim] @ newest
+        displaced = self._predictor.by_start(time_s, self._samples, self._odometry)[:dim] @ newest
         covariance: FloatArray = (displaced @ displaced.T)[None]
         return covariance
 
@@ -311,12 +337,14 @@ class InertialFixedLagSmoother(MeasurementWindow):
         searched = searched.select(searched.time_s >= begin_s)
         found = self._search(searched)
         knots = found.knots
-        prior = diffuse_inertial_prior(knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only)
+        prior = diffuse_inertial_prior(
+            knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only, self._odometry
+        )
         sigmas = np.diag(prior.information) ** -0.5
         sigmas[:9] = _DIFFUSE_SIGMAS
         anchor = replace(prior, information=np.diag(sigmas**-2.0))
-        setup = InertialSetup(self._contiguous(knots.time_s), self._noise, self._gyro_only)
-        self._window = _Window(knots, found.factors, setup.samples.at(knots.time_s), anchor, setup.samples)
+        samples = self._contiguous(knots.time_s)
+        self._window = _Window(knots, found.factors, samples.at(knots.time_s), anchor, samples)
         # Without measurements before the horizon, which the start needed.
         held = searched.time_s >= self._horizon_s
         first = int(found.knot_index[held][0])
@@ -352,6 +380,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if not found.determined:
             raise GeometryError("the measurements do not tell the heading of the robot")
         start = found.solution
+        if self._odometry is not None:
+            setup = replace(setup, odometry=self._odometry)
+            return solve_inertial(mounted, setup, start.knots.with_wheels(), start.gravity)
         return solve_inertial(mounted, setup, start.knots, start.gravity, factors=start.factors)
 
     def _update_tracked(self, held: Observations, new: Observations) -> bool:
@@ -408,7 +439,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         else:
             found = solve_inertial(
                 observations,
-                InertialSetup(window.samples, self._noise, self._gyro_only),
+                InertialSetup(window.samples, self._noise, self._gyro_only, self._odometry),
                 knots,
                 gravity,
                 anchor=window.anchor,
@@ -459,7 +490,12 @@ class InertialFixedLagSmoother(MeasurementWindow):
             return old.select(row)
         changed = np.flatnonzero(~kept)
         found = InertialFactors.between(
-            samples, knots.select(changed), times_s[changed + 1], self._noise, gyro_only=self._gyro_only
+            samples,
+            knots.select(changed),
+            times_s[changed + 1],
+            self._noise,
+            gyro_only=self._gyro_only,
+            odometry=self._odometry,
         )
         if not kept.any():
             return found
@@ -660,6 +696,8 @@ def _propagate(
         states.position[row], states.velocity[row], states.bias_or_acceleration[row] = moved
         states.rotation[row] = start.rotation[0] @ motion.rotation[0]
     states.gyro_bias[row] = start.gyro_bias[0]
+    if factors.odometry is not None:
+        states.wheels[row] = factors.odometry.kept[row - 1] * start.wheels[0]
 
 
 def _factorise(system: InertialEquations) -> BorderedCholesky:

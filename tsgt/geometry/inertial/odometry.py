@@ -38,6 +38,11 @@ class OdometrySamples:
     duration_s: FloatArray  # (N,)
     speed_mps: FloatArray  # (N,) along the direction of travel, positive forwards
 
+    @classmethod
+    def none(cls) -> OdometrySamples:
+        """Return no samples."""
+        return cls(np.empty(0), np.empty(0), np.empty(0))
+
     def __len__(self) -> int:
         return len(self.end_s)
 

@@ -12,15 +12,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.geometry.inertial.odometry import linearise_odometry
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import strapdown
-from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, concatenate_inertial_states
 from tsgt.geometry.rigid import IDENTITY, FloatArray, matvec, skew
+from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
 from tsgt.geometry.trajectory.motion_prior import process_noise, transition
 from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.geometry.trajectory.states import STATE_DIM, States
 
 if TYPE_CHECKING:
+    from tsgt.geometry.inertial.odometry import Odometry, OdometrySteps
     from tsgt.geometry.inertial.preintegration import Preintegrated
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
@@ -37,7 +40,6 @@ instants: for a spectrum that is flat from 8 to 60 Hz.
 """
 PREDICTION_NOISE_SCALE = 2.0  # On the variances of the motion prior, as without an IMU
 
-_DIM = INERTIAL_STATE_DIM + TILT_DIM
 _POSE_DIM = 6
 
 
@@ -46,8 +48,9 @@ class _Link:
     """A predicted state; errors are those of the state and of the tilt."""
 
     state: InertialStates  # One
-    covariance: FloatArray  # (17, 17)
-    by_start: FloatArray  # (17, 17) by the error of the newest knot
+    gravity: Gravity  # With the tilt
+    covariance: FloatArray  # (D + 2, D + 2)
+    by_start: FloatArray  # (D + 2, D + 2) by the error of the newest knot
 
     @property
     def time_s(self) -> float:
@@ -55,7 +58,7 @@ class _Link:
 
 
 class StrapdownPredictor:
-    """Predicts from one state of the IMU, with the (17, 17) covariance of its error and of the tilt's.
+    """Predicts from one state of the IMU, with the (D + 2, D + 2) covariance of its error and of the tilt's.
 
     ``motion`` is the prior beyond the last sample; ``gyro_only``: for positions everywhere.
     """
@@ -71,7 +74,8 @@ class StrapdownPredictor:
         *,
         gyro_only: bool = False,
     ) -> None:
-        self._links = [_Link(start, covariance, np.eye(_DIM))]
+        self._dim = len(covariance)
+        self._links = [_Link(start, gravity, covariance, np.eye(self._dim))]
         self._gravity, self._noise, self._mounting, self._motion = gravity, noise, mounting, motion
         self._gyro_only = gyro_only
 
@@ -84,13 +88,15 @@ class StrapdownPredictor:
         """Forget what was predicted beyond a time: samples there were missing."""
         self._links[1:] = [link for link in self._links[1:] if link.time_s <= time_s]
 
-    def at(self, time_s: float, samples: InertialSamples) -> tuple[States, FloatArray]:
+    def at(
+        self, time_s: float, samples: InertialSamples, odometry: Odometry | None = None
+    ) -> tuple[States, FloatArray]:
         """State of the reference point and the robot's axes, and the (1, 6, 6) covariance of its pose.
 
-        ``samples``: those present, at least from the start on and at least one.
+        ``samples``: those present, at least from the start on and at least one; ``odometry`` where the start has wheels.
         """
         end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
-        link = self._at(end_s, samples)
+        link = self._at(end_s, samples, odometry)
         state, by_error = self._reference_state(link.state, samples, beyond=time_s > end_s)
         covariance = by_error @ link.covariance @ by_error.T
         if time_s > end_s:
@@ -100,10 +106,12 @@ class StrapdownPredictor:
         covariance = covariance[:_POSE_DIM, :_POSE_DIM]
         return state, 0.5 * (covariance + covariance.T)[None]
 
-    def by_start(self, time_s: float, samples: InertialSamples) -> FloatArray:
-        """(6, 17) Jacobian of the pose's error at a time by the error of the newest knot and of the tilt."""
+    def by_start(
+        self, time_s: float, samples: InertialSamples, odometry: Odometry | None = None
+    ) -> FloatArray:
+        """(6, D + 2) Jacobian of the pose's error at a time by the error of the newest knot and of the tilt."""
         end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
-        link = self._at(end_s, samples)
+        link = self._at(end_s, samples, odometry)
         state, by_error = self._reference_state(link.state, samples, beyond=time_s > end_s)
         by_start: FloatArray = by_error @ link.by_start
         if time_s > end_s:
@@ -111,16 +119,18 @@ class StrapdownPredictor:
             by_start = onward.by_start(time_s) @ by_start
         return by_start[:_POSE_DIM]
 
-    def _at(self, end_s: float, samples: InertialSamples) -> _Link:
+    def _at(self, end_s: float, samples: InertialSamples, odometry: Odometry | None) -> _Link:
         """Predict to a time up to the last sample, and keep states on the way."""
         while self._links[-1].time_s + LINK_S <= end_s:
             last = self._links[-1]
-            self._links.append(self._onward(last, last.time_s + LINK_S, samples))
+            self._links.append(self._onward(last, last.time_s + LINK_S, samples, odometry))
         number = min(int((end_s - self.time_s) / LINK_S), len(self._links) - 1)
         link = self._links[number]
-        return link if link.time_s == end_s else self._onward(link, end_s, samples)
+        return link if link.time_s == end_s else self._onward(link, end_s, samples, odometry)
 
-    def _onward(self, link: _Link, end_s: float, samples: InertialSamples) -> _Link:
+    def _onward(
+        self, link: _Link, end_s: float, samples: InertialSamples, odometry: Odometry | None
+    ) -> _Link:
         """Predict from one state to a later time, by samples up to then at least."""
         first = int(np.searchsorted(samples.end_s, link.time_s, side="right"))
         stop = int(np.searchsorted(samples.end_s, end_s)) + 1
@@ -130,27 +140,70 @@ class StrapdownPredictor:
         state = link.state
         bias = np.zeros(3) if self._gyro_only else state.bias_or_acceleration
         motion = preintegrate(present, state.time_s, np.array([end_s]), state.gyro_bias, bias)
-        moved, by_link, noise = (self._turned if self._gyro_only else self._integrated)(state, motion)
+        if self._gyro_only:
+            moved, by_link, noise = self._turned(state, motion)
+        else:
+            moved, by_link, noise = self._integrated(state, link.gravity, motion)
         step_s = end_s - link.time_s
         walks = [self._noise.gyro_bias_walk, 0.0 if self._gyro_only else self._noise.accelerometer_bias_walk]
         np.einsum("ii->i", noise)[9:15] += np.repeat(np.square(walks) * step_s, 3)
+        moved = replace(moved, time_s=np.array([end_s]))
+        if odometry is not None:
+            steps = odometry.between(present, state.time_s, np.array([end_s]), state.gyro_bias)
+            return self._driven(link, moved, by_link, noise, steps)
         return _Link(
-            replace(moved, time_s=np.array([end_s])),
+            moved,
+            link.gravity,
             by_link @ link.covariance @ by_link.T + noise,
             by_link @ link.by_start,
         )
 
+    def _driven(
+        self,
+        link: _Link,
+        moved: InertialStates,
+        by_link: FloatArray,
+        noise: FloatArray,
+        steps: OdometrySteps,
+    ) -> _Link:
+        """Predict with wheel odometry over the step: the update of a Kalman filter, whose measurement both its ends enter."""
+        wheels, size = slice(INERTIAL_STATE_DIM, moved.dim), moved.dim
+        np.einsum("ii->i", by_link)[wheels] = steps.kept[0]
+        np.einsum("ii->i", noise)[wheels] += steps.variances[0]
+        moved = replace(moved, wheels=steps.kept * link.state.wheels)
+        rows = linearise_odometry(concatenate_inertial_states([link.state, moved]), steps)[0]
+        covariance = by_link @ link.covariance @ by_link.T + noise
+        by_start = by_link @ link.by_start
+        by_end = np.zeros((len(rows), self._dim))
+        by_end[:, :size] = rows[:, size : 2 * size]
+        by_both = by_end @ by_link
+        by_both[:, :size] += rows[:, :size]
+        mixed = by_link @ link.covariance @ by_both.T + noise @ by_end.T
+        innovation = by_both @ link.covariance @ by_both.T + by_end @ noise @ by_end.T + np.eye(len(rows))
+        gain = np.linalg.solve(innovation, mixed.T).T
+        residual = rows[:, -1]
+        if residual @ np.linalg.solve(innovation, residual) > OUTLIER_THRESHOLD**2:  # wheels that spin
+            return _Link(moved, link.gravity, covariance, by_start)
+        error = -gain @ residual
+        covariance -= gain @ mixed.T
+        return _Link(
+            moved.retract(error[None, :size]),
+            replace(link.gravity, tilt=link.gravity.tilt + error[size:]),
+            0.5 * (covariance + covariance.T),
+            by_start - gain @ by_both @ link.by_start,
+        )
+
     def _integrated(
-        self, state: InertialStates, motion: Preintegrated
+        self, state: InertialStates, gravity: Gravity, motion: Preintegrated
     ) -> tuple[InertialStates, FloatArray, FloatArray]:
-        """State after a motion, Jacobian of its error, and covariance of the samples' noise, (17, 17) each."""
-        found = strapdown(state, self._gravity, motion)
+        """State after a motion, Jacobian of its error, and covariance of the samples' noise, (D + 2, D + 2) each."""
+        found = strapdown(state, gravity, motion)
         step_s = float(motion.duration_s[0])
-        by_start, noise = np.eye(_DIM), np.zeros((_DIM, _DIM))
+        by_start, noise = np.eye(self._dim), np.zeros((self._dim, self._dim))
         by_start[0:9, :INERTIAL_STATE_DIM] = found.by_start[0]
-        by_tilt = self._gravity.by_tilt()
-        by_start[0:3, INERTIAL_STATE_DIM:] = 0.5 * step_s**2 * by_tilt
-        by_start[6:9, INERTIAL_STATE_DIM:] = step_s * by_tilt
+        by_tilt = gravity.by_tilt()
+        by_start[0:3, -TILT_DIM:] = 0.5 * step_s**2 * by_tilt
+        by_start[6:9, -TILT_DIM:] = step_s * by_tilt
         noise[0:9, 0:9] = found.noise[0]
         moved = replace(state, position=found.position, rotation=found.rotation, velocity=found.velocity)
         return moved, by_start, noise
@@ -164,7 +217,7 @@ class StrapdownPredictor:
         phi = transition(step_s, time_s)[0]
         axes = np.stack([np.zeros(3), state.velocity[0], state.bias_or_acceleration[0]])
         moved = phi @ axes
-        by_start, noise = np.eye(_DIM), np.zeros((_DIM, _DIM))
+        by_start, noise = np.eye(self._dim), np.zeros((self._dim, self._dim))
         by_start[3:6, 3:6] = motion.rotation[0].T
         by_start[3:6, 9:12] = motion.by_gyro_bias[0, 3:6]
         noise[3:6, 3:6] = motion.covariance[0, 3:6, 3:6]
@@ -188,7 +241,7 @@ class StrapdownPredictor:
     def _reference_state(
         self, state: InertialStates, samples: InertialSamples, *, beyond: bool
     ) -> tuple[States, FloatArray]:
-        """State of the reference point, with rate and acceleration by the samples, and its Jacobian, (18, 17).
+        """State of the reference point, with rate and acceleration by the samples, and its Jacobian, (18, D + 2).
 
         ``beyond``: to go on with it beyond the last sample.
         """
@@ -205,7 +258,7 @@ class StrapdownPredictor:
         else:
             acceleration = matvec(rotation, force - state.bias_or_acceleration[0]) + self._gravity.vector()
         to_robot = self._mounting.rotation
-        by_error = np.zeros((STATE_DIM, _DIM))
+        by_error = np.zeros((STATE_DIM, self._dim))
         by_error[0:3, 0:3] = by_error[6:9, 6:9] = IDENTITY
         by_error[0:3, 3:6] = -rotation @ skew(arm)
         by_error[3:6, 3:6] = to_robot

@@ -78,8 +78,9 @@ class Stream(StreamBase):
         self, series: str = LIVE, *, max_age_s: float | None = None, include_invalid: bool = False
     ) -> Pose | None:
         """Read what has arrived, without waiting, and return the newest pose; None if it is stale, invalid or missing."""
-        while records := self._pump.step():
-            self._take(records)
+        self._take(self._pump.step())
+        while self._pump.more:
+            self._take(self._pump.step())
         return self._newest_pose(series, max_age_s, include_invalid=include_invalid)
 
     def _wait(self, wait: WaitFor) -> None:

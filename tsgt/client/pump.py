@@ -33,8 +33,10 @@ BACK_OFF_S = (0.1, 2.0)
 CONNECT_TIMEOUT_NS = 5_000_000_000
 """For everything until the first line."""
 
-MAX_RECEIVES = 32  # of one step, so that a burst does not keep the caller for long
 RECEIVE_BYTES = 1 << 16
+
+MAX_RECEIVES = 2
+"""Of one step, so that a burst, as after a resumption, neither keeps the caller for long nor overflows its queues."""
 
 log = logging.getLogger("tsgt.client")
 
@@ -90,6 +92,8 @@ class Pump:
         self._was_ready = False
         self.ended = False
         """Whether nothing will follow."""
+        self.more = False
+        """Whether the last step left data that had arrived."""
         self.problem = ""
         """Why there is no connection, in one line; empty while there is one."""
 
@@ -100,6 +104,7 @@ class Pump:
         any failure without reconnection.
         """
         records: list[Record] = []
+        self.more = False
         if self.ended:
             return records
         try:
@@ -188,6 +193,7 @@ class Pump:
                 raise StreamError("the stream has ended")
             self._received_ns = self._now_ns()
             self._take(data, records)
+        self.more = True
 
     def _take(self, data: bytes, records: list[Record]) -> None:
         if self._tls is not None:

@@ -26,7 +26,7 @@ INTERPOLATED_AGE_S = 3.0  # radio and the next measurement of each prism, with r
 DEFAULT_LAG_S = 3.0  # of a stream without the record ``setup``
 BATCH_S = 1.5  # final smoothed poses are sent some at a time
 
-QUEUE_RECORDS = 1000
+QUEUE_RECORDS = 2000
 """Of each iterator; when it is full, the oldest record is lost and a :class:`Gap` tells of it."""
 
 

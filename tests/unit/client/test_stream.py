@@ -203,6 +203,13 @@ def test_stale_poses_are_skipped(tmp_path: Path) -> None:
         assert stream.stale_poses == 29
 
 
+def test_latest_pose_is_behind_many_other_lines(tmp_path: Path) -> None:
+    """All that has arrived is read."""
+    with clocked(tmp_path) as (stream, server, _):
+        server.sendall(lines(HELLO, *[b'{"type":"noise"}'] * 8_000, predicted(0)))
+        assert stream.latest() is not None
+
+
 def test_invalid_poses_are_left_out(tmp_path: Path) -> None:
     """Unless they are wanted."""
     with clocked(tmp_path) as (stream, server, _):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.records import HELLO, POSE, SETUP
 
-from tsgt.client import AsyncStream, AuthenticationError, Gap, Hello, Pose, Setup
+from tsgt.client import AsyncStream, AuthenticationError, Event, Gap, Hello, Pose, Setup
 from tsgt.client.records import monotonic_ns
 from tsgt.client.tls import relay_context
 from tsgt.recording import encode_line
@@ -225,6 +225,26 @@ def test_cut_connection_is_resumed() -> None:
             found = await asyncio.wait_for(taken(stream, 10), 5)
             stamps = [record.stamp_ns for record in found if isinstance(record, Pose)]
             assert stamps == [POSE.stamp_ns + number * 50_000_000 for number in range(10)]
+
+    asyncio.run(main())
+
+
+def test_long_resumption_overflows_no_queue() -> None:
+    """The lines of some minutes arrive within a moment."""
+    count = 4000
+
+    async def main() -> None:
+        async with (
+            relay(max_bytes=10_000_000) as server,
+            AsyncStream(f"relay://{LOOPBACK}:{server.port}", key=KEY) as stream,
+        ):
+            await asyncio.wait_for(taken(stream, 2), 5)
+            for reader in list(server.readers):
+                reader.abort()
+            for number in range(count):
+                server.line(b'{"type":"event","stamp_ns":%d,"event":"e","message":""}' % number)
+            found = await asyncio.wait_for(taken(stream, count), 10)
+        assert [record.stamp_ns for record in found if isinstance(record, Event)] == list(range(count))
 
     asyncio.run(main())
 

@@ -1,0 +1,195 @@
+"""The C++ header: compiled without warnings, and its example against a master, a relay and rubbish."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from harness.network import Master, stopping, wait_until
+from harness.records import EVENT, HELLO, NO_POSE, POSE, SETUP
+
+from tsgt.radio.key_file import write_key
+from tsgt.recording import encode_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "integrations" / "cpp"
+GXX = shutil.which("g++") or ""
+pytestmark = pytest.mark.skipif(not GXX, reason="g++ is not installed")
+
+AWKWARD = replace(
+    POSE,
+    kind="predicted",
+    stamp_ns=9_007_199_254_740_993,  # beyond what a double can hold
+    position_m=(0.1 + 0.2, -5e-324, 1.7976931348623157e308),
+    orientation_xyzw=(1 / 3, -0.0, 123456.7, 1e-7),
+)
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Compile the example."""
+    path = tmp_path_factory.mktemp("cpp") / "print_poses"
+    warnings = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
+    command = [GXX, "-std=c++17", "-O1", *warnings, "-o", str(path), str(FOLDER / "print_poses.cpp")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return path
+
+
+@contextmanager
+def serving(path: Path, *connections: bytes) -> Iterator[None]:
+    """Serve each connection its bytes and close it."""
+
+    def serve() -> None:
+        for data in connections:
+            connection, _ = listener.accept()
+            with connection:
+                connection.sendall(data)
+
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield
+        thread.join(10)
+
+
+@contextmanager
+def printing(program: Path, folder: Path, *arguments: str) -> Iterator[Path]:
+    """Run the example; gives the file with its output."""
+    with (
+        (folder / "out").open("wb") as output,
+        (folder / "err").open("wb") as errors,
+        stopping(subprocess.Popen([program, *arguments], stdout=output, stderr=errors)),
+    ):
+        yield folder / "out"
+
+
+def lines(*records: object) -> bytes:
+    """Return records as on the wire."""
+    return b"".join((line if isinstance(line, bytes) else encode_line(line)) + b"\n" for line in records)
+
+
+def test_numbers_arrive_to_the_last_bit(program: Path, tmp_path: Path) -> None:
+    """Times as 64-bit integers, positions and rotations as the same doubles."""
+    sent = (
+        HELLO,
+        SETUP,
+        b'{"type":"weather","x":[{"y":"\\u00e9\\ud83d\\ude00"}]}',
+        AWKWARD,
+    )
+    with serving(tmp_path / "s", lines(*sent)), printing(program, tmp_path, str(tmp_path / "s")) as output:
+        wait_until(output, 2)
+        hello, pose = output.read_text().splitlines()[:2]
+    assert hello == f"hello {HELLO.version}"
+    numbers, age = pose.split("; ")
+    kind, stamp, *rest = numbers.split()
+    assert (kind, int(stamp)) == ("pose", AWKWARD.stamp_ns)
+    sent_numbers = json.loads(encode_line(AWKWARD))
+    assert [float(number).hex() for number in rest] == [
+        float(number).hex() for number in (*sent_numbers["position_m"], *sent_numbers["orientation_xyzw"])
+    ]
+    assert age.startswith("age 0.0")
+
+
+def test_gaps_events_and_reasons_are_told(program: Path, tmp_path: Path) -> None:
+    """Also unusable lines, and a restart of the master."""
+    first = lines(HELLO, NO_POSE, EVENT, b'{"type":"pose"}', b'{"type":')
+    with (
+        serving(tmp_path / "s", first, lines(HELLO)),
+        printing(program, tmp_path, str(tmp_path / "s")) as output,
+    ):
+        wait_until(output, 8)
+        found = output.read_text().splitlines()
+    assert [line.split("; ")[0] for line in found] == [
+        f"hello {HELLO.version}",
+        f"pose {NO_POSE.stamp_ns} invalid: outage",
+        f"event {EVENT.stamp_ns} lines_lost: lost 7 lines",
+        "gap 7 this reader was too slow for the master",
+        "gap 1 a line cannot be used: expected a string",
+        "gap 1 a line cannot be used: not JSON",
+        "gap ? the connection to the master was lost",
+        f"hello {HELLO.version}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("data", "error"),
+    [
+        (b'{"type":"hello","protocol":2}\n', "another protocol version"),
+        (b"220 mail\n", "not a stream of tsgt"),
+    ],
+)
+def test_other_streams_are_errors(program: Path, tmp_path: Path, data: bytes, error: str) -> None:
+    """Another attempt would not help."""
+    with serving(tmp_path / "s", data):
+        done = subprocess.run(
+            [program, tmp_path / "s"], capture_output=True, text=True, check=False, timeout=20
+        )
+    assert done.returncode == 1
+    assert error in done.stderr
+
+
+@contextmanager
+def relay(folder: Path, port: int) -> Iterator[str]:
+    """Run a relay; gives its address."""
+    command = [
+        sys.executable, "-m", "tsgt", "relay", "--socket", str(folder / "s"), "--key", str(folder / "relay.key"),
+        "--listen", f"127.0.0.1:{port}",
+    ]  # fmt: skip
+    with (folder / "relay.log").open("ab") as log, stopping(subprocess.Popen(command, cwd=ROOT, stderr=log)):
+        yield f"relay://127.0.0.1:{port}"
+
+
+def free_port() -> int:
+    """Return a port that no program uses."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def test_relay_is_read_and_its_restart_told(program: Path, tmp_path: Path) -> None:
+    """Handshake and tags are right; after the relay's restart it goes on with a gap."""
+    write_key(tmp_path / "relay.key")
+    port = free_port()
+    with Master(tmp_path / "s").running():
+        with relay(tmp_path, port) as address:
+            time.sleep(1)
+            with printing(program, tmp_path, address, str(tmp_path / "relay.key")) as output:
+                wait_until(output, 20)
+                stopped = output.read_bytes().count(b"\n")
+                assert stopped >= 20
+        with (
+            relay(tmp_path, port) as address,
+            printing(program, tmp_path, address, str(tmp_path / "relay.key")) as output,
+        ):
+            wait_until(output, 20)
+    found = output.read_text().splitlines()
+    assert found[0] == f"hello {HELLO.version}"
+    assert [line.split()[0] for line in found[1:]] == ["pose"] * (len(found) - 1)
+
+
+def test_wrong_key_gets_nothing(program: Path, tmp_path: Path) -> None:
+    """And the program ends with the reason."""
+    write_key(tmp_path / "relay.key")
+    write_key(tmp_path / "other.key")
+    with Master(tmp_path / "s").running(), relay(tmp_path, free_port()) as address:
+        time.sleep(1.5)
+        command = [program, address, tmp_path / "other.key"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=20)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "the relay has another key" in done.stderr

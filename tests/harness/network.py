@@ -67,6 +67,7 @@ class Network:
                 stderr=errors,
                 cwd=ROOT,
                 env=environment,
+                start_new_session=True,
             )
 
 
@@ -96,15 +97,19 @@ def _ip(*arguments: str) -> None:
 
 @contextmanager
 def stopping(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]:
-    """Stop a process at the end."""
+    """Stop a process at the end, and its children if it leads a session."""
     try:
         yield process
     finally:
-        process.send_signal(signal.SIGTERM)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(5)
-        process.kill()
-        process.wait()
+        leads = os.getsid(process.pid) == process.pid if process.poll() is None else False
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            with suppress(ProcessLookupError):
+                if leads:
+                    os.killpg(process.pid, number)
+                else:
+                    process.send_signal(number)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(5)
 
 
 @dataclass

@@ -189,7 +189,7 @@ def test_wrong_key_gets_nothing(program: Path, tmp_path: Path) -> None:
     write_key(tmp_path / "other.key")
     with Master(tmp_path / "s").running(), relay(tmp_path, free_port()) as address:
         time.sleep(1.5)
-        command = [program, address, tmp_path / "other.key"]
+        command = [str(program), address, str(tmp_path / "other.key")]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=20)
     assert (done.returncode, done.stdout) == (1, "")
     assert "the relay has another key" in done.stderr

@@ -484,6 +484,10 @@ class ImuNoise(FiniteNumbers):
     """Bias of the gyro after switching on, in rad/s."""
     accelerometer_bias_mps2: float
     """Bias of the accelerometer after switching on, in m/s^2."""
+    gyro_scale_misalignment: float = 1e-4
+    """Error of each entry of ``ImuParameters.gyro_matrix``: of its calibration, and by temperature since."""
+    accelerometer_scale_misalignment: float = 7e-4
+    """Error of each entry of the accelerometer's matrix of scale factors and misalignment, which is not calibrated."""
 
     def __post_init__(self) -> None:
         """Reject noise that no instrument has."""

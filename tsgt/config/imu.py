@@ -22,6 +22,8 @@ IMU_NOISE: dict[str, ImuNoise] = {
         accelerometer_bias_walk=8e-6 * _G,
         gyro_bias_radps=0.15 * _DEG,
         accelerometer_bias_mps2=3e-3 * _G,
+        gyro_scale_misalignment=1e-4,
+        accelerometer_scale_misalignment=7e-4,
     ),
     # Chips in lidars and cameras: Bosch BMI088, TDK ICM-20948.
     "consumer": ImuNoise(
@@ -31,6 +33,8 @@ IMU_NOISE: dict[str, ImuNoise] = {
         accelerometer_bias_walk=30e-6 * _G,
         gyro_bias_radps=0.7 * _DEG,
         accelerometer_bias_mps2=20e-3 * _G,
+        gyro_scale_misalignment=1e-3,  # Once calibrated: 0.03 %/K as it warms up
+        accelerometer_scale_misalignment=7e-3,
     ),
 }
 """Noise of two classes of IMUs."""
@@ -57,6 +61,10 @@ class ImuNoiseConfig(Model):
     """Bias of the gyro after switching on; default: the preset's."""
     accelerometer_bias_mps2: Density = None
     """Bias of the accelerometer after switching on; default: the preset's."""
+    gyro_scale_misalignment: Density = None
+    """Error of each entry of ``gyro_matrix``, of its calibration and by temperature since; default: the preset's."""
+    accelerometer_scale_misalignment: Density = None
+    """Scale error and misalignment of the accelerometer's axes; default: the preset's."""
 
     def noise(self) -> ImuNoise:
         """Return the noise in SI units."""
@@ -70,6 +78,9 @@ class ImuNoiseConfig(Model):
             or preset.accelerometer_bias_walk,
             gyro_bias_radps=self.gyro_bias_radps or preset.gyro_bias_radps,
             accelerometer_bias_mps2=self.accelerometer_bias_mps2 or preset.accelerometer_bias_mps2,
+            gyro_scale_misalignment=self.gyro_scale_misalignment or preset.gyro_scale_misalignment,
+            accelerometer_scale_misalignment=self.accelerometer_scale_misalignment
+            or preset.accelerometer_scale_misalignment,
         )
 
 

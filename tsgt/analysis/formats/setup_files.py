@@ -114,6 +114,8 @@ def write_imu_mounting(path: Path, imu: ImuParameters, *, comment: str, covarian
             "accelerometer_bias_walk_mps2_per_sqrt_s": imu.noise.accelerometer_bias_walk,
             "gyro_bias_radps": imu.noise.gyro_bias_radps,
             "accelerometer_bias_mps2": imu.noise.accelerometer_bias_mps2,
+            "gyro_scale_misalignment": imu.noise.gyro_scale_misalignment,
+            "accelerometer_scale_misalignment": imu.noise.accelerometer_scale_misalignment,
         },
     }
     _write(path, content, covariance, comment)

@@ -27,6 +27,7 @@ from tsgt.geometry.inertial.odometry import Odometry, OdometrySamples
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
+from tsgt.geometry.inertial.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
 from tsgt.geometry.inertial.sensitivity import InertialSensitivity, Linearised
 from tsgt.geometry.inertial.smoother import estimation_noise
@@ -122,6 +123,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._initial_gravity = self._gravity = Gravity.of(imu)
         self._health = HealthMonitor(imu)
         self._samples: InertialSamples | None = None
+        self._rotation_predictor = RotationPredictor()
         self._stale_from_s = np.inf  # Samples after this have arrived since the integration
         self._window: _Window | None = None
         self._solved: _Solved | None = None
@@ -169,6 +171,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if not len(new):
             return
         new = new.select(self._health.samples(new))
+        self._rotation_predictor.learn(new)
         held, stuck_s = self._samples, self._health.stuck_from_s
         parts = [each.select(each.end_s <= stuck_s) for each in (held, new) if each is not None]
         joined = concatenate_samples(parts)
@@ -532,6 +535,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._mounting,
             self._prior,
             gyro_only=self._gyro_only is not None,
+            rotation_predictor=self._rotation_predictor,
         )
         return self._check(found.squared_distances, covariance[3:6, 3:6])
 

@@ -1,8 +1,8 @@
 """Prediction of the robot's motion beyond the newest knot: strapdown with the samples present, then the motion prior. Sans-I/O.
 
 The state and its covariance are kept a quarter of a second apart, so that a prediction integrates few samples however long
-nothing has been measured. Beyond the last sample the robot goes on with the angular rate and the acceleration of the last
-samples, as the motion prior says.
+nothing has been measured. Beyond the last sample a linear predictor turns the robot on, and it goes on with the acceleration of the
+last samples, as the motion prior says.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from tsgt.geometry.inertial.odometry import linearise_odometry
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import strapdown
+from tsgt.geometry.inertial.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, concatenate_inertial_states
 from tsgt.geometry.rigid import IDENTITY, FloatArray, matvec, skew
 from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
@@ -25,6 +26,7 @@ from tsgt.geometry.trajectory.states import STATE_DIM, States
 if TYPE_CHECKING:
     from tsgt.geometry.inertial.odometry import Odometry, OdometrySteps
     from tsgt.geometry.inertial.preintegration import Preintegrated
+    from tsgt.geometry.inertial.rate_prediction import PredictedRotation
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
     from tsgt.model import ImuNoise, MotionPrior
@@ -60,7 +62,8 @@ class _Link:
 class StrapdownPredictor:
     """Predicts from one state of the IMU, with the (D + 2, D + 2) covariance of its error and of the tilt's.
 
-    ``motion`` is the prior beyond the last sample; ``gyro_only``: for positions everywhere.
+    ``motion`` is the prior beyond the last sample; ``gyro_only``: for positions everywhere. ``rotation_predictor``: what has learnt from
+    the samples how the robot is shaken.
     """
 
     def __init__(
@@ -73,7 +76,9 @@ class StrapdownPredictor:
         motion: MotionPrior,
         *,
         gyro_only: bool = False,
+        rotation_predictor: RotationPredictor | None = None,
     ) -> None:
+        self._rotation_predictor = rotation_predictor or RotationPredictor()
         self._dim = len(covariance)
         self._links = [_Link(start, gravity, covariance, np.eye(self._dim))]
         self._gravity, self._noise, self._mounting, self._motion = gravity, noise, mounting, motion
@@ -97,10 +102,12 @@ class StrapdownPredictor:
         """
         end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
         link = self._at(end_s, samples, odometry)
-        state, by_error = self._reference_state(link.state, samples, beyond=time_s > end_s)
+        onward_s = time_s - end_s
+        turning = self._turning(link.state, samples, onward_s)
+        state, by_error = self._reference_state(link.state, samples, onward_s, turning)
         covariance = by_error @ link.covariance @ by_error.T
-        if time_s > end_s:
-            covariance += self._trend_noise(samples)
+        if onward_s > 0:
+            covariance += self._trend_noise(samples, onward_s, turning)
             onward = Propagator(state, covariance, self._motion, process_noise_scale=PREDICTION_NOISE_SCALE)
             return onward.at(time_s, dim=_POSE_DIM)
         covariance = covariance[:_POSE_DIM, :_POSE_DIM]
@@ -112,7 +119,9 @@ class StrapdownPredictor:
         """(6, D + 2) Jacobian of the pose's error at a time by the error of the newest knot and of the tilt."""
         end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
         link = self._at(end_s, samples, odometry)
-        state, by_error = self._reference_state(link.state, samples, beyond=time_s > end_s)
+        onward_s = time_s - end_s
+        turning = self._turning(link.state, samples, onward_s)
+        state, by_error = self._reference_state(link.state, samples, onward_s, turning)
         by_start: FloatArray = by_error @ link.by_start
         if time_s > end_s:
             onward = Propagator(state, np.zeros((STATE_DIM, STATE_DIM)), self._motion)
@@ -238,21 +247,33 @@ class StrapdownPredictor:
             noise,
         )
 
+    def _turning(
+        self, state: InertialStates, samples: InertialSamples, onward_s: float
+    ) -> PredictedRotation | None:
+        """Rotation beyond the last sample, if there are enough to predict it."""
+        if onward_s <= 0:
+            return None
+        return self._rotation_predictor.predict(samples, state.gyro_bias[0], onward_s)
+
     def _reference_state(
-        self, state: InertialStates, samples: InertialSamples, *, beyond: bool
+        self,
+        state: InertialStates,
+        samples: InertialSamples,
+        onward_s: float,
+        turning: PredictedRotation | None,
     ) -> tuple[States, FloatArray]:
         """State of the reference point, with rate and acceleration by the samples, and its Jacobian, (18, D + 2).
 
-        ``beyond``: to go on with it beyond the last sample.
+        ``onward_s``: how long to go on with it beyond the last sample, with the predicted rate if there is one.
         """
-        if beyond:
+        if onward_s > 0:
             rate, force = (each.mean(axis=0) for each in _newest(samples))
         else:
             row = min(int(np.searchsorted(samples.end_s, state.time_s[0] - 1e-9)), len(samples) - 1)
             rate, force = samples.angular_rate_radps[row], samples.specific_force_mps2[row]
-        rate = rate - state.gyro_bias[0]
+        rate = rate - state.gyro_bias[0] if turning is None else turning.rate
         rotation, arm = state.rotation[0], self._mounting.in_imu(np.zeros(3))
-        turning = np.cross(rate, arm)
+        circular = np.cross(rate, arm)
         if self._gyro_only:
             acceleration = state.bias_or_acceleration[0]
         else:
@@ -262,7 +283,7 @@ class StrapdownPredictor:
         by_error[0:3, 0:3] = by_error[6:9, 6:9] = IDENTITY
         by_error[0:3, 3:6] = -rotation @ skew(arm)
         by_error[3:6, 3:6] = to_robot
-        by_error[6:9, 3:6] = -rotation @ skew(turning)
+        by_error[6:9, 3:6] = -rotation @ skew(circular)
         by_error[6:9, 9:12] = rotation @ skew(arm)
         by_error[9:12, 9:12] = -to_robot
         if self._gyro_only:
@@ -271,14 +292,16 @@ class StrapdownPredictor:
             state.time_s,
             state.position + matvec(rotation, arm),
             state.rotation @ to_robot.T,
-            state.velocity + matvec(rotation, turning),
+            state.velocity + matvec(rotation, circular),
             (to_robot @ rate)[None],
-            (acceleration + matvec(rotation, np.cross(rate, turning)))[None],
+            (acceleration + matvec(rotation, np.cross(rate, circular)))[None],
             np.zeros((1, 3)),
         )
         return found, by_error
 
-    def _trend_noise(self, samples: InertialSamples) -> FloatArray:
+    def _trend_noise(
+        self, samples: InertialSamples, onward_s: float, turning: PredictedRotation | None
+    ) -> FloatArray:
         """(18, 18) covariance of the motion that goes on beyond the last sample about that of the last samples."""
         rates, forces = _newest(samples)
         rate, force = (float(np.sqrt(each.var(axis=0).mean())) for each in (rates, forces))
@@ -290,6 +313,10 @@ class StrapdownPredictor:
         sigmas[1] = SHAKING_TIME_S * rate
         sigmas[3] = lag_s * angular
         sigmas[5] = angular
+        if turning is not None:
+            # What shook it alone tells nothing of the next turn, whose angular acceleration is that of the prior.
+            sigmas[1] = np.maximum(turning.sigma_rad, lag_s * onward_s * angular)
+            sigmas[3] = 0.0
         if not self._gyro_only:
             sigmas[2] = SHAKING_TIME_S * force
             sigmas[4] = (

@@ -541,7 +541,7 @@ class ImuParameters(FiniteNumbers):
 class ImuSamples:
     """Consecutive samples of the robot's IMU, raw: each is the mean over an interval of time.
 
-    The lists have one entry per sample; they hold one line of the program that reads the IMU, about ten samples.
+    The lists have one entry per sample; they hold one line of the program that reads the IMU, some 25 ms.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}

@@ -19,7 +19,7 @@ import time
 from typing import Any
 
 FORMAT_VERSION = 1
-LINES_PER_S = 20
+LINES_PER_S = 40
 
 
 class Printer:

@@ -25,7 +25,7 @@ ATTEMPTS = 6  # of each request: a device that sends at full rate may garble the
 
 SILENCE_TIMEOUT_S = 1.0  # without a sample
 
-LINES_PER_S = 20
+LINES_PER_S = 40
 
 _READ_BYTES = 4096
 

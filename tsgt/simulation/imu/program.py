@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from tsgt.simulation.imu.presets import ImuModel
     from tsgt.simulation.imu.samples import DeviceSamples
 
-SAMPLES_PER_LINE: Final = 10
+SAMPLES_PER_LINE: Final = 5
 
-MAX_WAIT_S: Final = 0.060
+MAX_WAIT_S: Final = 0.030
 """An incomplete line is printed when a sample arrives this long after its first one."""
 
 

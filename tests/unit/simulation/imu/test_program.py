@@ -68,13 +68,13 @@ def _run(samples: DeviceSamples, spans_s: Sequence[tuple[float, float]]) -> list
 
 
 def test_lines_hold_all_samples_at_their_arrival() -> None:
-    """After hello, ten samples a line, each line at the arrival of its last sample."""
+    """After hello, five samples a line, each line at the arrival of its last sample."""
     samples = _samples()
     (output,) = _run(samples, [(0.0, 4.5)])
     (_, hello), *lines = output.lines
     assert (hello["type"], hello["imu"], hello["rate_hz"]) == ("hello", 1, 200.0)
     assert [number for _, line in lines for number in line["counter"]] == samples.counter.tolist()
-    assert {len(line["counter"]) for _, line in lines[:-1]} == {10}
+    assert {len(line["counter"]) for _, line in lines[:-1]} == {5}
     for at_s, line in lines:
         assert round(at_s * 1e9) == line["host_time_ns"][-1]
     rates = np.concatenate([line["angular_rate_radps"] for _, line in lines])
@@ -100,7 +100,7 @@ def test_nothing_is_printed_in_silence() -> None:
     assert not [at_s for at_s, _ in output.lines if 1.06 < at_s < 2.5]
     for _, line in output.lines[1:]:
         arrivals_ns = line["host_time_ns"]
-        assert arrivals_ns[-1] - arrivals_ns[0] <= 60_000_000
+        assert arrivals_ns[-1] - arrivals_ns[0] <= 30_000_000
 
 
 def test_late_burst_is_printed_at_once() -> None:

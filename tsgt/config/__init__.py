@@ -5,6 +5,7 @@ The top-level key ``kind`` of a file selects its model: ``client``, ``master``, 
 ``parameters`` converts, ``permissions`` rejects files that everybody can change.
 """
 
+from tsgt.config.alarms import AlarmsConfig
 from tsgt.config.base import Model, NoiseConfig
 from tsgt.config.calibration import (
     ImuMounting,
@@ -75,6 +76,7 @@ __all__ = [
     "IMU_NOISE",
     "KINDS",
     "MAX_STATION_NUMBERS",
+    "AlarmsConfig",
     "Baud",
     "BridgeInstrumentConfig",
     "ClassicConfig",

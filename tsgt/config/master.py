@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from tsgt.config.alarms import AlarmsConfig
 from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, unique_by
 from tsgt.config.imu import ImuConfig
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
@@ -127,6 +128,8 @@ class MasterConfig(Model):
     """Layout monitor."""
     geofences: Annotated[tuple[GeofenceConfig, ...], unique_by("name")] = ()
     """Geofences."""
+    alarms: AlarmsConfig | None = None
+    """Events that leave the machine; none without this table."""
     stream: StreamConfig = StreamConfig()
     """Pose stream."""
     recording: RecordingConfig = RecordingConfig()

@@ -21,6 +21,7 @@ from tsgt.clock import UnixTimeline
 from tsgt.config import ClassicMasterConfig
 from tsgt.errors import RadioError, StreamError
 from tsgt.imu import Imu
+from tsgt.master.alarms import Alarms
 from tsgt.master.classic import ClassicLink
 from tsgt.master.imu_monitor import ImuUseMonitor
 from tsgt.master.link_events import MasterEvent
@@ -96,30 +97,38 @@ async def run_master(
     """
     clock = dependencies.clock
     timeline = UnixTimeline.fixed_now(clock)
-    start_ns = timeline.unix_ns(clock.monotonic_ns())
+
+    def unix_now_ns() -> int:
+        return timeline.unix_ns(clock.monotonic_ns())
+
+    start_ns = unix_now_ns()
     path = new_recording_path(config.recording.directory, "master", start_ns)
     server = StreamServer(
         config.stream.socket,
         encode_line(HelloRecord(limits=ValidityLimits.of(parameters))),
         mode=int(config.stream.mode, 8),
         queue_lines=config.stream.queue_lines,
-        unix_now_ns=lambda: timeline.unix_ns(clock.monotonic_ns()),
+        unix_now_ns=unix_now_ns,
     )
     with (
         ThreadPoolExecutor(1, "imu_setup_check") as checks,
         RecordingWriter(path, write=dependencies.write) as writer,
     ):
         recorder = Recorder(writer)
-        recording = RecordingThread(recorder, lambda: timeline.unix_ns(clock.monotonic_ns()))
+        recording = RecordingThread(recorder, unix_now_ns)
         header = RecordingHeader(
             software=f"tsgt {tsgt.__version__}", created_ns=start_ns, source="tsgt-master"
         )
         recorder.put(encode_line(header))
         recorder.put(encode_line(parameters))
 
+        alarms = None if config.alarms is None else Alarms(config.alarms, clock, unix_now_ns)
+
         def emit(record: object, line: bytes) -> None:
             if isinstance(record, EventRecord):
                 log.info("stream_event", name=record.event, message=record.message)
+                if alarms is not None:
+                    alarms.take(record)
             recording.put(line)
             if not isinstance(record, ImuSamples):  # raw samples are for post-processing
                 server.publish(line)
@@ -138,7 +147,7 @@ async def run_master(
                         *(GeofenceObserver(geofence, group) for geofence in config.geofences),
                     ],
                     emit,
-                    lambda: timeline.unix_ns(clock.monotonic_ns()),
+                    unix_now_ns,
                     lambda work: checks.submit(work).result,
                 )
                 publisher.put(_setup_record(config, parameters, start_ns, path.name, dependencies.key))
@@ -156,6 +165,8 @@ async def run_master(
                 group.create_task(master.publish_due_poses())
                 group.create_task(master.publish_status())
                 group.create_task(master.notify_watchdog())
+                if alarms is not None:
+                    group.create_task(alarms.run())
                 if imu is not None:
                     group.create_task(imu.run())
                 radio_opener = master.with_radio_events(dependencies.open_radio)

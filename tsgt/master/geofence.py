@@ -7,11 +7,7 @@ configured number of standard deviations, is beyond the boundary, or when there 
 
 from __future__ import annotations
 
-import asyncio
 import math
-import os
-import signal
-from contextlib import suppress
 from typing import TYPE_CHECKING, Protocol
 
 import structlog
@@ -19,6 +15,7 @@ import structlog
 from tsgt.master.publisher import Observer
 from tsgt.polygon import contains, distance_to_edge, edges
 from tsgt.recording import EventRecord
+from tsgt.service import run_command
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -133,47 +130,13 @@ class Geofence(Observer):
         return clearance_m - self._settings.margin_m
 
 
-COMMAND_TIMEOUT_S = 10.0  # after this a command is killed, with its child processes
-
-KILL_TIMEOUT_S = 0.5
-"""How long to wait for the end of a killed command: one that may not be killed must not block the master."""
-
 log = structlog.get_logger()
 
 
 async def run_geofence_command(command: Sequence[str], *, event: str, fence: str) -> None:
     """Run a command with ``TSGT_EVENT`` and ``TSGT_FENCE`` in its environment, and log its outcome."""
-    problem = await _problem(command, os.environ | {"TSGT_EVENT": event, "TSGT_FENCE": fence})
+    problem = await run_command(command, {"TSGT_EVENT": event, "TSGT_FENCE": fence})
     if problem:
         log.error("fence_command_failed", fence=fence, command=command[0], error=problem)
     else:
         log.info("fence_command_done", fence=fence, command=command[0])
-
-
-async def _problem(command: Sequence[str], environment: dict[str, str]) -> str:
-    """Run a command; return what went wrong, or an empty string."""
-    environment.pop("NOTIFY_SOCKET", None)  # only the service itself may notify systemd
-    try:
-        process = await asyncio.create_subprocess_exec(
-            *command,
-            env=environment,
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.DEVNULL,
-            start_new_session=True,
-        )
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in an argument
-        return f"cannot be started ({error})"
-    try:
-        async with asyncio.timeout(COMMAND_TIMEOUT_S):
-            status = await process.wait()
-    except TimeoutError:
-        return f"killed after {COMMAND_TIMEOUT_S:g} s"
-    else:
-        return f"exit status {status}" if status else ""
-    finally:
-        if process.returncode is None:
-            with suppress(ProcessLookupError, PermissionError):  # it may run as another user
-                os.killpg(process.pid, signal.SIGKILL)
-            with suppress(TimeoutError):
-                async with asyncio.timeout(KILL_TIMEOUT_S):
-                    await process.wait()

@@ -1,9 +1,10 @@
 """Services to a daemon: orderly shutdown, systemd, periodic sync to disk, UNIX sockets, and supervised programs.
 
-`daemon` are the first ones; `program` runs a child process that prints lines, which `program_lines` splits and rejects;
+`daemon` are the first ones; `program` runs a child process that prints lines, which `program_lines` splits and rejects; `command` runs one once;
 `log_limiter` limits warnings that could be logged with every line or packet.
 """
 
+from tsgt.service.command import run_command
 from tsgt.service.daemon import (
     MAX_SOCKET_PATH_BYTES,
     UnixListener,
@@ -31,6 +32,7 @@ __all__ = [
     "notify_systemd",
     "printable",
     "run",
+    "run_command",
     "sd_notify",
     "start_process",
     "sync_periodically",

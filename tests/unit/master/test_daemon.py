@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
 from contextlib import asynccontextmanager
 from itertools import pairwise
@@ -17,7 +18,7 @@ from harness.field import DISK, STATIONS, TRUE, field_of, running
 from harness.radios import PAPER
 from harness.scene import START, driving, stationary_scene
 
-from tsgt.config import GeofenceConfig, ImuConfig
+from tsgt.config import AlarmsConfig, GeofenceConfig, ImuConfig
 from tsgt.errors import RadioError
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.geofence import run_geofence_command
@@ -448,11 +449,11 @@ async def test_status_has_recording_disk_and_target_checks(tmp_path: Path) -> No
         config.recording.directory.mkdir()
         write_target_checks(config.recording.directory, {2: True}, START - 60_000 * MS)
         async with running(field.master(config)):
-            await asyncio.sleep(7.5)
+            await asyncio.sleep(3.5)
             status = field.of(StatusRecord)[-1]
             assert events(field) == []
             field.disk = DiskStatus(free_bytes=500_000_000, total_bytes=32_000_000_000)
-            await asyncio.sleep(7)
+            await asyncio.sleep(4)
             assert events(field) == ["disk_low"]
             last = field.of(StatusRecord)[-1]
         recording = config.recording.directory / (field.of(SetupRecord)[0].recording or "")
@@ -466,6 +467,32 @@ async def test_status_has_recording_disk_and_target_checks(tmp_path: Path) -> No
     ages_s = [station.last_target_check_age_s for station in status.stations]
     assert (ages_s[0], ages_s[2]) == (None, None)
     assert ages_s[1] == pytest.approx(60 + (status.stamp_ns - START) / 1e9)
+
+
+async def test_alarms_leave_the_machine(tmp_path: Path) -> None:
+    """An event of the master that is an alarm; a program that never ends delays nothing, and is stopped at the end."""
+    alarms: list[bytes] = []
+    stopped = asyncio.Event()
+
+    async def hang(_command: object, _environment: object, *, stdin: bytes) -> str:
+        alarms.append(stdin)
+        try:
+            await asyncio.sleep(1000)
+        finally:
+            stopped.set()
+        return ""
+
+    config = AlarmsConfig(site="yard", command=("siren",))
+    async with field_of(tmp_path, superframe=True) as field:
+        with patch("tsgt.master.alarms.run_command", hang):
+            async with running(field.master(field.config(alarms=config))):
+                field.disk = DiskStatus(free_bytes=500_000_000, total_bytes=32_000_000_000)
+                await asyncio.sleep(6)
+    (line,) = alarms
+    assert json.loads(line)["event"] == "disk_low"
+    assert json.loads(line)["site"] == "yard"
+    assert len(field.of(StatusRecord)) == 6
+    assert stopped.is_set()
 
 
 async def test_setup_is_recorded_and_streamed(tmp_path: Path) -> None:

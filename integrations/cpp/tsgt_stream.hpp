@@ -2,15 +2,14 @@
 //
 //     tsgt::Stream stream("/run/tsgt/poses.sock");                       // on the robot's computer
 //     tsgt::Stream stream("relay://192.168.1.10", "relay.key");          // on another one, from `tsgt relay` without TLS
-//     while (true) {
-//       if (auto record = stream.next(std::chrono::milliseconds(100)))
-//         if (const auto* pose = std::get_if<tsgt::Pose>(&*record)) ...
-//       if (const tsgt::Pose* pose = stream.latest(0.5)) ...             // null while the newest one is older than that
-//     }
+//     while (auto record = stream.next(std::chrono::hours(1)))           // everything, in order; or, in a control loop,
+//       if (const auto* pose = std::get_if<tsgt::Pose>(&*record)) ...
+//     if (const tsgt::Pose* pose = stream.latest(0.2)) ...               // null while the newest one is older than 0.2 s
 //
 // It connects again by itself, goes on after the last line that it has got from a relay, and tells what is missing (Gap).
 // docs/reference/stream.md has the fields with units and frames, docs/reference/relay.md the relay's protocol.
-// Not for several threads at once.
+// Not for several threads at once. Nothing here waits longer than it is told to, but for the look-up of a name: give numeric
+// addresses where that matters.
 
 #ifndef TSGT_STREAM_HPP
 #define TSGT_STREAM_HPP
@@ -515,8 +514,12 @@ class Stream {
     return record;
   }
 
-  // The newest valid live pose (predicted or interpolated) of all that next() has read from the socket; null if it is older.
-  const Pose* latest(double max_age_s) const {
+  // The newest live pose (predicted or interpolated); null while it is older or invalid. Reads what has arrived, without
+  // waiting, and drops all other records: use either this or next().
+  const Pose* latest(double max_age_s) {
+    do step(monotonic_ns());
+    while (more_);
+    records_.clear();
     return latest_ && latest_->valid && latest_->age_s() <= max_age_s ? &*latest_ : nullptr;
   }
 
@@ -527,13 +530,14 @@ class Stream {
   bool over_relay() const { return !key_.empty(); }
 
   void step(std::int64_t until) {
+    more_ = false;
     try {
       if (socket_ < 0) {
         wait(-1, 0, std::min(until, retry_));
         if (monotonic_ns() < retry_) return;
         connect();
       }
-      receive(until);
+      if (!connecting_ || connected(until)) receive(until);
     } catch (const detail::Lost& lost) {
       disconnect();
       if (at_key_ && !was_ready_) throw Error(source_ + ": the relay has another key, or has seen too many wrong ones");
@@ -572,28 +576,35 @@ class Stream {
       freeaddrinfo(found);
       open(address.ai_family, reinterpret_cast<const sockaddr*>(&storage), address.ai_addrlen);
     }
-    connected_ = heard_ = monotonic_ns();
+    heard_ = monotonic_ns();
     if (!over_relay()) ++connections_;
   }
 
   void open(int family, const sockaddr* address, socklen_t size) {
     socket_ = socket(family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
     if (socket_ < 0) fail(errno);
-    if (::connect(socket_, address, size) == 0) return;
-    if (errno != EINPROGRESS) fail(errno);
-    const std::int64_t deadline = monotonic_ns() + detail::kConnectTimeout;
-    while (!wait(socket_, POLLOUT, deadline))
+    connecting_ = ::connect(socket_, address, size) != 0;
+    if (connecting_ && errno != EINPROGRESS) fail(errno);
+  }
+
+  bool connected(std::int64_t until) {
+    const std::int64_t deadline = heard_ + detail::kConnectTimeout;
+    if (!wait(socket_, POLLOUT, std::min(until, deadline))) {
       if (monotonic_ns() >= deadline) throw detail::Lost("nothing answers");
+      return false;
+    }
     int code = 0;
     socklen_t length = sizeof(code);
     getsockopt(socket_, SOL_SOCKET, SO_ERROR, &code, &length);
     if (code != 0) fail(code);
+    connecting_ = false;
+    return true;
   }
 
   void disconnect() {
     if (socket_ >= 0) close(socket_);
     socket_ = -1;
-    ready_ = false;
+    ready_ = connecting_ = false;
   }
 
   void receive(std::int64_t until) {
@@ -610,6 +621,7 @@ class Stream {
       return;
     }
     heard_ = monotonic_ns();
+    more_ = true;
     received_.append(data.data(), static_cast<std::size_t>(count));
     std::size_t start = 0;
     for (std::size_t end; (end = received_.find('\n', start)) != std::string::npos; start = end + 1)
@@ -759,9 +771,9 @@ class Stream {
   }
 
   std::string source_, host_, port_, key_, line_key_, stream_, challenge_, request_, received_, problem_;
-  bool resume_, ready_ = false, was_ready_ = false, at_key_ = false, greeted_ = false;
+  bool resume_, connecting_ = false, more_ = false, ready_ = false, was_ready_ = false, at_key_ = false, greeted_ = false;
   int socket_ = -1, connections_ = 0;
-  std::int64_t next_ = 0, last_beat_ = 0, connected_ = 0, heard_ = 0, retry_ = 0, back_off_ = detail::kFirstBackOff;
+  std::int64_t next_ = 0, last_beat_ = 0, heard_ = 0, retry_ = 0, back_off_ = detail::kFirstBackOff;
   detail::LeastDelay session_, network_;
   std::deque<Record> records_;
   std::optional<Pose> latest_;

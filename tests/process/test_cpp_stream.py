@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import socket
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.network import Master, stopping, wait_until
+from harness.network import PERIOD_NS, Master, stopping, wait_until
 from harness.records import EVENT, HELLO, NO_POSE, POSE, SETUP
 
 from tsgt.radio.key_file import write_key
@@ -104,6 +105,49 @@ def test_numbers_arrive_to_the_last_bit(program: Path, tmp_path: Path) -> None:
         float(number).hex() for number in (*sent_numbers["position_m"], *sent_numbers["orientation_xyzw"])
     ]
     assert age.startswith("age 0.0")
+
+
+LATEST = """
+#include <cinttypes>
+#include <cstdio>
+#include "tsgt_stream.hpp"
+int main(int, char** argv) {
+  tsgt::Stream stream(argv[1]);
+  const auto start = tsgt::monotonic_ns();
+  std::int64_t last = 0;
+  while (tsgt::monotonic_ns() - start < 3000000000) {
+    const auto* pose = stream.latest(0.3);
+    const std::int64_t stamp = pose == nullptr ? -1 : pose->stamp_ns;
+    if (stamp != last) std::printf("%" PRId64 "\\n", stamp);
+    last = stamp;
+    poll(nullptr, 0, 5);
+  }
+}
+"""
+
+
+def test_latest_pose_becomes_stale(tmp_path: Path) -> None:
+    """A control loop gets each new pose, and none once the master is silent."""
+    (tmp_path / "latest.cpp").write_text(LATEST)
+    command = [
+        GXX,
+        "-std=c++17",
+        "-I",
+        str(FOLDER),
+        "-o",
+        str(tmp_path / "latest"),
+        str(tmp_path / "latest.cpp"),
+    ]
+    subprocess.run(command, check=True)
+    with Master(tmp_path / "s").running() as master:
+        program = subprocess.Popen([tmp_path / "latest", tmp_path / "s"], stdout=subprocess.PIPE, text=True)
+        time.sleep(1.5)
+    printed, _ = program.communicate(timeout=20)
+    first, *poses, last = map(int, printed.split())
+    assert (first, last) == (-1, -1)
+    assert len(poses) >= 20
+    assert [after - before for before, after in itertools.pairwise(poses)] == [PERIOD_NS] * (len(poses) - 1)
+    assert poses[-1] == master.first_ns + (master.sent - 1) * PERIOD_NS
 
 
 def test_gaps_events_and_reasons_are_told(program: Path, tmp_path: Path) -> None:

@@ -90,6 +90,7 @@ class Pump:
         self._attempts = 0
         self._received_ns = 0
         self._was_ready = False
+        self._logged: set[str] = set()
         self.ended = False
         """Whether nothing will follow."""
         self.more = False
@@ -216,6 +217,7 @@ class Pump:
         if self._link.ready:
             self._was_ready = True
             self._back_off_s = BACK_OFF_S[0]
+            self._logged.clear()
             self.problem = ""
 
     def _decode(self, arrival: Arrival, records: list[Record]) -> None:
@@ -266,7 +268,8 @@ class Pump:
             if self._was_ready and reason == "the stream has ended":
                 return
             raise StreamError(problem) from error
-        if problem != self.problem:
+        if problem not in self._logged:
+            self._logged.add(problem)
             log.warning("no stream: %s; trying again", problem)
         self.problem = problem
         self._retry_ns = self._now_ns() + round(self._back_off_s * 1e9)

@@ -261,3 +261,21 @@ def test_two_iterators_get_everything(tmp_path: Path) -> None:
         tmp_path / "s", lines(HELLO, predicted(0), replace(EVENT, stamp_ns=POSE.stamp_ns), predicted(1))
     ):
         assert asyncio.run(follow()) == (2, 1)
+
+
+def test_each_reason_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Until there is a connection, however often reasons alternate."""
+    now_ns = [0]
+    with Stream(tmp_path / "s", now_ns=lambda: now_ns[0]) as stream:
+        for attempt in range(6):
+            if attempt % 2:
+                (tmp_path / "s").write_bytes(b"")
+            else:
+                (tmp_path / "s").unlink(missing_ok=True)
+            stream.latest()
+            now_ns[0] += 10_000 * MS
+        assert stream.problem.endswith("Connection refused")
+    assert [record.getMessage().rpartition(": ")[2] for record in caplog.records] == [
+        "No such file or directory; trying again",
+        "Connection refused; trying again",
+    ]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from harness.records import EVENT, HELLO, NO_POSE, POSE, SETUP, measurement
 
 from tsgt.recording import encode_line
 
-FOLLOW_STREAM = Path(__file__).parents[2] / "examples" / "follow_stream.py"
+ROOT = Path(__file__).parents[2]
+FOLLOW_STREAM = ROOT / "examples" / "follow_stream.py"
 
 
 def followed(tmp_path: Path, lines: list[bytes]) -> tuple[int, list[str]]:
@@ -47,6 +50,40 @@ def test_example_follows_the_stream(tmp_path: Path) -> None:
             "event: lost 7 lines",
         ],
     )
+
+
+def test_example_with_the_client_follows_the_stream(tmp_path: Path) -> None:
+    """It goes on after the end of the stream, and tells the gap."""
+    predicted = replace(POSE, kind="predicted")
+    first = b"".join(encode_line(record) + b"\n" for record in (HELLO, measurement(0), NO_POSE, predicted))
+    second = b"".join(encode_line(record) + b"\n" for record in (HELLO, EVENT))
+    path = tmp_path / "s"
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        with subprocess.Popen(
+            [sys.executable, str(ROOT / "examples" / "follow_poses.py"), str(path)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=environment,
+        ) as process:
+            assert process.stdout is not None
+            listener.settimeout(20)
+            for data in (first, second):
+                connection, _ = listener.accept()
+                with connection:
+                    connection.sendall(data)
+            printed = [process.stdout.readline() for _ in range(5)]
+            process.kill()
+    assert [line.strip() for line in printed] == [
+        "no pose: outage",
+        f"{POSE.stamp_ns} ns: 1.000 2.000 -0.100 m",
+        "gap: some lines (the connection to the master was lost)",
+        "event: lost 7 lines",
+        "gap: 7 lines (this reader was too slow for the master)",
+    ]
 
 
 def test_example_stops_at_another_protocol(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from tsgt.errors import StreamError
 
 DEFAULT_SOCKET = Path("/run/tsgt/poses.sock")
 
-_RELAY = re.compile(r"relay(s?)://(\[[^\]/]+\]|[^\[\]:/?#@]+)(?::(\d{1,5}))?/?")
+_RELAY = re.compile(r"relay(s?)://(\[[^\]/]+\]|[^\[\]:/?#@\s]+)(?::(\d{1,5}))?/?")
 _MAX_KEY_FILE_BYTES = 1024
 
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 from harness.records import EVENT, HELLO, NO_POSE, POSE, STATUS, measurement
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tsgt.client import (
     AsyncStream,
@@ -24,6 +26,7 @@ from tsgt.client import (
     Status,
     Stream,
 )
+from tsgt.client.links import Arrival, SocketLink
 from tsgt.errors import StreamError
 from tsgt.recording import encode_line
 
@@ -148,6 +151,22 @@ def test_what_is_no_stream_is_an_error(tmp_path: Path, read: Callable[..., list[
         pytest.raises(StreamError, match="not a line of a tsgt stream"),
     ):
         read(tmp_path / "s", 99, reconnect=False)
+
+
+@settings(max_examples=30)
+@given(st.lists(st.integers(1, 400), max_size=30))
+def test_lines_may_arrive_in_any_pieces(sizes: list[int]) -> None:
+    """A line may be cut anywhere."""
+    link = SocketLink()
+    link.connected("")
+    data = lines(HELLO, predicted(0), STATUS)
+    found: list[object] = []
+    for size in [*sizes, len(data)]:
+        found += link.receive(data[:size], 0)
+        data = data[size:]
+    assert [item.line for item in found if isinstance(item, Arrival)] == lines(
+        HELLO, predicted(0), STATUS
+    ).splitlines()
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.batch import fit_trajectory, scale_noise
-from tsgt.geometry.inertial import Gravity, Mounting
+from tsgt.geometry.inertial import Gravity, Mounting, sound_samples
 from tsgt.geometry.inertial_calibration import SetupCheck, check_imu_setup
 from tsgt.recording import EventRecord
 
@@ -73,7 +73,7 @@ def check_recorded_setup(
         return SetupCheck()
     origin_ns = measurements[0].stamp_ns
     observations, _ = build_observations(parameters, measurements, origin_ns=origin_ns)
-    samples = inertial_samples(records, imu, origin_ns)
+    samples = sound_samples(inertial_samples(records, imu, origin_ns), imu)
     rotation = rotation_from_quaternion(np.array(imu.orientation_xyzw))
     mounting = Mounting(rotation, np.array(imu.position_m) - centroid_m(parameters))
     observations = scale_noise(observations, noise_scales(parameters))
@@ -124,6 +124,14 @@ class ImuSetupMonitor:
         """Return the events since the last call."""
         events, self._events = self._events, []
         return events
+
+    def restart(self) -> None:
+        """Confirm the set-up anew, from what comes from now on: it may have changed."""
+        self._measurements.clear()
+        self._records.clear()
+        self._next_ns = self._result = None
+        self._confirmed = False
+        self._open = tuple(_PARTS.values())
 
     def measurement(self, measurement: Measurement) -> None:
         """Take a measurement at its ``received_ns``."""

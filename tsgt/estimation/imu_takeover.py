@@ -33,8 +33,11 @@ SILENCE_S = 0.3
 SOUND_S = 1.0
 """How long a silent IMU must have been heard again before its trajectory is used."""
 
-QUARANTINE_S = 4.0
-"""How long an IMU that disagreed must have been sound: until the window holds nothing from before."""
+QUARANTINE_S, MAX_QUARANTINE_S = 4.0, 64.0
+"""How long an IMU that disagreed must have been sound: until the window holds nothing from before, and each time twice as long if it
+disagrees again within :data:`PROVEN_S` of use.
+"""
+PROVEN_S = 60.0
 
 CONTRADICTION_S = 0.4
 """How long measurements may contradict the trajectory with the IMU, and not the one without, until that takes over. A single
@@ -149,6 +152,11 @@ class InertialWindow(TrajectoryWindow, Protocol):
         ...
 
     @property
+    def setup_in_doubt(self) -> bool:
+        """Whether its mounting may have changed."""
+        ...
+
+    @property
     def biases(self) -> tuple[FloatArray, FloatArray | None] | None:
         """Newest biases of gyro and accelerometer, (3,) each; None where unknown."""
         ...
@@ -197,6 +205,7 @@ class ImuTakeover:
         self._unaided_from_s: float | None = None
         self._nis = (0.0, 0.0)  # of the predicted and of a smoothed pose
         self._contradiction = ""
+        self._quarantine_s, self._used_from_s = 0.0, -np.inf
         self.use = ImuUse.STARTING
         self._disagreement = ""
 
@@ -260,15 +269,25 @@ class ImuTakeover:
         found = self._found(now_s)
         if found in _WRONG:
             self._disagreement = self._untrusted or self._contradiction
+            # What the samples show by themselves passes; whatever else it was may have come to stay.
+            doubt = self._with.setup_in_doubt or self._with.health is None
+            if found == ImuUse.DISAGREES and doubt and self._setup is not None:
+                self._setup.restart()
+            if self.use == ImuUse.USED:
+                again = now_s - self._used_from_s < PROVEN_S
+                self._quarantine_s = min(2 * self._quarantine_s, MAX_QUARANTINE_S) if again else 0.0
             self._contradicted_from_s, self._nis, self._contradiction = np.inf, (0.0, 0.0), ""
             self._with = self._create_with()
-            self._sound_from_s = now_s + QUARANTINE_S
+            self._quarantine_s = max(self._quarantine_s, QUARANTINE_S)
+            self._sound_from_s = now_s + self._quarantine_s
         elif found == ImuUse.SILENT:
             self._sound_from_s = now_s + SOUND_S
         elif now_s < self._sound_from_s:
             found = self.use
         if found != ImuUse.USED:
             self._update_without()
+        elif self.use != ImuUse.USED:
+            self._used_from_s = now_s
         self.use = found
 
     def marginalise_before(self, before_s: float) -> None:

@@ -13,7 +13,7 @@ from harness.records import IMU_PARAMETERS, imu_samples
 from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
 from tsgt.estimation import LiveEstimator, imu_setup_monitor
-from tsgt.estimation.imu_takeover import QUARANTINE_S, SILENCE_S, SOUND_S, UNAIDED_S, ImuTakeover
+from tsgt.estimation.imu_takeover import PROVEN_S, QUARANTINE_S, SILENCE_S, SOUND_S, UNAIDED_S, ImuTakeover
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.geometry.trajectory import FixedLagSmoother
@@ -39,6 +39,7 @@ class FakeInertialSmoother(FixedLagSmoother):
         super().__init__(prior)
         self.up_m = UP_M
         self.health: str | None = None
+        self.setup_in_doubt = False
         self.contradicted = False
         self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
         self.samples: list[InertialSamples] = []
@@ -66,6 +67,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     monkeypatch.setattr("tsgt.estimation.continuous.InertialFixedLagSmoother", FakeInertialSmoother)
     monkeypatch.setattr(imu_setup_monitor, "FIRST_NS", 0)
     monkeypatch.setattr(imu_setup_monitor, "RESULT_NS", 0)
+    monkeypatch.setattr(imu_setup_monitor, "UNCONFIRMED_INTERVAL_NS", SECOND // 2)
     scene = stationary_scene().moving(driving).with_limits(estimator="continuous", period_ns=100_000_000)
     return replace(scene, parameters=replace(scene.parameters, imu=IMU_PARAMETERS))
 
@@ -235,6 +237,70 @@ def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
     changes = [use for use, _ in itertools.groupby(uses)]
     assert changes == [ImuUse.UNCONFIRMED, ImuUse.USED, ImuUse.UNCONFIRMED]
     assert uses.index(ImuUse.USED) == round(2 * UNAIDED_S)
+
+
+@pytest.fixture
+def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuTakeover, SimpleNamespace, SimpleNamespace]:
+    """Return what chooses, a window with IMU, and the monitor of its set-up; all is well."""
+    monkeypatch.setattr(ImuTakeover, "_compare", lambda *_: None)
+    without = SimpleNamespace(converged=True, ambiguous=False)
+    window = SimpleNamespace(
+        converged=True, ambiguous=False, health=None, setup_in_doubt=False, add_samples=lambda _: None
+    )
+    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="")
+    setup.restart = lambda: setattr(setup, "confirmed", False)
+    takeover = ImuTakeover(
+        IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
+    )
+    takeover.begin(START)
+    return takeover, window, setup
+
+
+def uses_of(takeover: ImuTakeover, from_s: float, until_s: float) -> list[tuple[ImuUse, float]]:
+    """Choose ten times a second; return each use, and for how long."""
+    uses = []
+    for number in range(round(10 * from_s), round(10 * until_s)):
+        takeover.add_samples(imu_samples(20 * number, count=20))
+        takeover.take_samples()
+        takeover.choose(0.1 * (number + 1))
+        uses.append(takeover.use)
+    return [(use, 0.1 * len(list(each))) for use, each in itertools.groupby(uses)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "use"), [("stuck", ImuUse.USED), ("blow", ImuUse.UNCONFIRMED), ("prisms", ImuUse.UNCONFIRMED)]
+)
+def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace], fault: str, use: ImuUse
+) -> None:
+    """After a blow, and where the prisms contradict, the IMU may have moved for good."""
+    takeover, window, setup = sound
+    uses_of(takeover, 0.0, 1.0)
+    window.health, window.setup_in_doubt = (fault if fault != "prisms" else None), fault == "blow"
+    window.ambiguous = fault == "prisms"
+    found = [uses_of(takeover, 1.0, 1.6)[-1][0]]
+    window.health, window.setup_in_doubt, window.ambiguous = None, False, False
+    found.append(uses_of(takeover, 1.6, 7.0)[-1][0])
+    setup.confirmed = True
+    found.append(uses_of(takeover, 7.0, 7.1)[-1][0])
+    assert found == [ImuUse.DISAGREES, use, ImuUse.USED]
+
+
+def test_quarantine_doubles_with_each_disagreement_in_a_row(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+) -> None:
+    """And is short again after a minute of use."""
+    takeover, window, _ = sound
+    found, now_s = [], 0.0
+    for used_s in (1.0, 1.0, 1.0, PROVEN_S + 1.0):
+        uses_of(takeover, now_s, now_s + used_s)
+        window.health = "stuck"
+        uses_of(takeover, now_s + used_s, now_s + used_s + 0.1)
+        window.health = None
+        (_, wrong_s), _ = uses_of(takeover, now_s + used_s + 0.1, now_s + used_s + 20.0)
+        found.append(wrong_s)
+        now_s += used_s + 0.1 + wrong_s
+    assert found == pytest.approx([4.0, 8.0, 16.0, 4.0], abs=0.11)
 
 
 def test_first_pose_after_a_measurement_states_its_jump(scene: Scene) -> None:

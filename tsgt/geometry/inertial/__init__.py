@@ -6,6 +6,7 @@ docs/explanation/imu.md derives the equations.
 
 from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
 from tsgt.geometry.inertial.fixed_lag import InertialFixedLagSmoother, WindowTrajectory
+from tsgt.geometry.inertial.health import sound_samples
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
 from tsgt.geometry.inertial.odometry import Odometry, OdometrySamples
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
@@ -64,6 +65,7 @@ __all__ = [
     "preintegrate",
     "search_heading",
     "solve_inertial",
+    "sound_samples",
     "states_on_tracks",
     "strapdown",
 ]

@@ -166,6 +166,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """
         return self._health.reason
 
+    @property
+    def setup_in_doubt(self) -> bool:
+        """Whether the mounting of the IMU may have changed: by a blow, or by whatever made the samples disagree with the prisms."""
+        return self._health.setup_in_doubt
+
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""
         if not len(new):

@@ -51,6 +51,19 @@ HOLD_S = 2.0
 """For which the samples must have been sound again: a few measurements of each prism, which have agreed with them."""
 
 
+_SOUND_PART = 100  # Samples at once, which bounds the span in which a limit is looked for
+
+
+def sound_samples(samples: InertialSamples, imu: ImuParameters) -> InertialSamples:
+    """Return those that can be used, judged by themselves."""
+    monitor = HealthMonitor(imu)
+    parts = [
+        monitor.samples(samples.select(slice(first, first + _SOUND_PART)))
+        for first in range(0, len(samples), _SOUND_PART)
+    ]
+    return samples.select(np.concatenate(parts)) if parts else samples
+
+
 class HealthMonitor:
     """Judges samples as they arrive, and innovations of the measurements; times on the time scale of the observations.
 

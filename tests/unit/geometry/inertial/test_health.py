@@ -10,7 +10,7 @@ import pytest
 from harness.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.geometry import FloatArray, exp_so3
-from tsgt.geometry.inertial import InertialFixedLagSmoother, InertialSamples
+from tsgt.geometry.inertial import InertialFixedLagSmoother, InertialSamples, sound_samples
 from tsgt.geometry.inertial.health import HOLD_S, MAX_AGE_S, STUCK_S, HealthMonitor
 from tsgt.model import MotionPrior
 
@@ -165,6 +165,15 @@ def test_blow_puts_the_setup_in_doubt() -> None:
     assert reasons[-1] is None
     assert monitor.setup_in_doubt
     assert not judged(SAMPLES)[0].setup_in_doubt
+
+
+def test_bad_samples_of_a_drive_are_left_out() -> None:
+    """And no others."""
+    samples = changed(slice(700, 702), force=np.array([0.0, 90.0, 9.0]))
+    assert (
+        np.setdiff1d(samples.end_s, sound_samples(samples, IMU).end_s).tolist()
+        == samples.end_s[700:702].tolist()
+    )
 
 
 def test_old_samples() -> None:

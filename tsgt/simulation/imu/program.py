@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -27,12 +27,12 @@ MAX_WAIT_S: Final = 0.030
 class ImuProgram:
     """Starts the program any number of times; it prints the samples that arrive while it runs.
 
-    ``clock`` shows true time as CLOCK_MONOTONIC, as the master's does.
+    ``clock`` shows true time as CLOCK_MONOTONIC, as the master's does. ``hello``: its first line.
     """
 
     def __init__(self, model: ImuModel, samples: DeviceSamples, clock: Clock) -> None:
         self._clock = clock
-        self._hello = _encoded(
+        self.hello = _encoded(
             {
                 "type": "hello",
                 "imu": 1,
@@ -51,17 +51,21 @@ class ImuProgram:
         return RunningImuProgram(asyncio.create_task(self._print(listener)))
 
     async def _print(self, listener: Listener) -> None:
-        listener.output_received(self._hello, self._clock.monotonic_ns())
+        listener.output_received(self.hello, self._clock.monotonic_ns())
+        for arrival_ns, line in self.lines(self._clock.monotonic_ns() / 1e9):
+            await self._clock.sleep_until(arrival_ns)
+            listener.output_received(line, self._clock.monotonic_ns())
+        await asyncio.Event().wait()
+
+    def lines(self, from_s: float = 0.0) -> Iterator[tuple[int, bytes]]:
+        """Yield the lines from a time on, each with its arrival in ns from the start."""
         arrival_s = self._samples.arrival_s
-        now_s = self._clock.monotonic_ns() / 1e9
-        first = int(np.searchsorted(arrival_s, now_s))
+        first = int(np.searchsorted(arrival_s, from_s))
         line = int(np.searchsorted(self._starts, first, side="right"))
         for end in [*self._starts[line:].tolist(), len(arrival_s)]:
             if end > first:
-                await self._clock.sleep_until(round(arrival_s[end - 1] * 1e9))
-                listener.output_received(self._line(slice(first, end)), self._clock.monotonic_ns())
+                yield round(arrival_s[end - 1] * 1e9), self._line(slice(first, end))
             first = end
-        await asyncio.Event().wait()
 
     def _line(self, rows: slice) -> bytes:
         samples = self._samples

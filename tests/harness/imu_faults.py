@@ -53,7 +53,7 @@ class Drive:
     imu: SimulatedImu
     seed: int
     parameters: Parameters
-    measurements: list[Measurement]
+    measurements: Sequence[Measurement]
 
     @classmethod
     def simulated(
@@ -152,7 +152,9 @@ class Drive:
             np.array([each.kind == "predicted" for each in records]),
             valid,
             np.array([each.imu or "" for each in records]),
-            *lengths.T,
+            lengths[:, 0],
+            lengths[:, 1],
+            lengths[:, 2],
             np.array([np.nan if each.jump_m is None else each.jump_m for each in records]),
         )
 

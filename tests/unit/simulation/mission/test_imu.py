@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from harness.imu_faults import Drive, start_confirmed
 from harness.missions import SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig, SimulatedImu
@@ -16,14 +18,23 @@ from tsgt.geometry import log_so3, rotation_from_quaternion, transform_from, tra
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.imu_samples import imu_failures
-from tsgt.simulation.faults import FaultKind
+from tsgt.simulation.checks.invariants import replay_mismatches
+from tsgt.simulation.imu import (
+    DeviceClockJump,
+    Dropout,
+    Knock,
+    LateBurst,
+    Saturation,
+    Silence,
+    StuckValues,
+)
 from tsgt.simulation.scenario_files import with_stations
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tsgt.simulation.imu import DeviceSamples
+    from tsgt.simulation.imu import DeviceSamples, ImuCondition
     from tsgt.simulation.mission import MissionResult
 
 PIPELINE = ScenarioConfig().pipeline.model_copy(update={"estimator": "linear"})
@@ -128,21 +139,50 @@ def test_mission_with_few_stations(tmp_path: Path, count: int) -> None:
     assert sum(len(record.stamp_ns) for record in read_imu_samples(path)) > 600
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["silence", "stuck", "late-burst", "dropout", "clock-jump"])
-def test_poses_survive_a_fault_of_the_imu(tmp_path: Path, kind: str) -> None:
-    """No valid pose is wrong, most poses are valid, and a replay repeats them.
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    """Drive for 28 s with three stations and an IMU; the trajectory with it is used from 14 s on."""
+    return Drive.simulated(tmp_path_factory.mktemp("drive"), seed=3, duration_s=28.0)
 
-    Knocks and saturation are measured by the soak: until they are noticed, single poses may be off by centimetres.
-    """
+
+CONDITIONS: dict[str, ImuCondition] = {
+    "silence": Silence(17.0, 2.0),
+    "stuck": StuckValues(17.0, 2.0),
+    "late-burst": LateBurst(17.0, 1.5),
+    "dropout": Dropout(17.0, 4.0, 0.5),
+    "clock-jump": DeviceClockJump(17.0, 0.5),
+    "saturation": Saturation(17.0, 4.0, 0.2, 11.0),
+    "knock": Knock(17.0, (0.010, -0.012, 0.008), (0.010, 0.014, -0.010)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", CONDITIONS)
+def test_poses_survive_a_fault_of_the_imu(drive: Drive, kind: str) -> None:
+    """No valid pose is wrong, most poses are valid, and the IMU is taken back, but for one that is displaced."""
+    poses = drive.poses(drive.samples([CONDITIONS[kind]]), start_check=start_confirmed)
+    assert not poses.wrong.any()
+    live = poses.select(poses.predicted)
+    uses = [str(use) for use, _ in itertools.groupby(live.imu[(live.time_s > 16.9) & (live.time_s < 27.5)])]
+    reasons = {"silence": "silent", "late-burst": "silent", "stuck": "silent"}
+    if kind in ("dropout", "clock-jump"):
+        assert uses[0] == uses[-1] == "used"
+    else:
+        assert uses[:2] == ["used", reasons.get(kind, "disagrees")]
+        assert uses[-1] == ("unconfirmed" if kind == "knock" else "used")
+    assert live.valid[live.time_s > 14.0].mean() > 0.95
+
+
+@pytest.mark.slow
+def test_replay_repeats_the_checks_of_the_setup(tmp_path: Path) -> None:
+    """Bit for bit, with the events on what a drive tells of the IMU."""
     scenario = WITH.model_copy(update={"pipeline": ScenarioConfig().pipeline})
-    faults = frozenset({FaultKind(f"imu-{kind}")})
-    # Of this seed: the fault begins after 9 s.
-    run = run_mission(tmp_path, scenario, duration_s=55.0, protocol=SUPERFRAME, seed=2, faults=faults)
-    assert sum(run.faults.values()) == 1
-    assert check_invariants(run) == []
-    poses = run.master_logs[0].valid_poses()
-    assert np.count_nonzero(poses.series == "predicted") > 0.9 * 20 * 55.0
+    run = run_mission(tmp_path, scenario, duration_s=26.0, protocol=SUPERFRAME, seed=3)
+    (log,) = run.master_logs
+    path = log.recording()
+    assert path is not None
+    assert b"imu_setup_confirmed" in path.read_bytes()
+    assert list(replay_mismatches(log)) == []
 
 
 @pytest.mark.slow

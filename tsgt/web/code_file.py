@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import os
 import stat
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from tsgt.config import check_permissions
 from tsgt.errors import ConfigError
 from tsgt.web.access import MAX_CODE_CHARACTERS, MIN_CODE_CHARACTERS
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def read_code(path: Path) -> str:
@@ -33,7 +30,10 @@ def read_code(path: Path) -> str:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(f"{path}: the access code cannot be read ({reason})", path=path) from error
     check_permissions(path)
-    if status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+    # systemd protects its credentials by access control lists, which look like permissions of a group.
+    credentials = os.environ.get("CREDENTIALS_DIRECTORY")
+    protected = credentials is not None and path.parent == Path(credentials)
+    if status.st_mode & (stat.S_IRWXG | stat.S_IRWXO) and not protected:
         raise ConfigError(
             f"{path}: its mode is {stat.S_IMODE(status.st_mode):04o}, but only its owner may have access to the code; "
             f"`chmod 600 {path}`",

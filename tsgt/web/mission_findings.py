@@ -142,16 +142,23 @@ def degradations(
 
 
 def _missing(pose: PoseRecord, conditions: Mapping[int, Condition]) -> str:
-    """Return which prisms are not measured; without a reason in the pose that of the greatest age."""
-    missing = [each for each in pose.stations if each.reason]
-    if not missing:
-        ages = [each for each in pose.stations if each.age_s is not None]
-        never = [each for each in pose.stations if each.age_s is None]
-        missing = never or sorted(ages, key=lambda each: -(each.age_s or 0.0))[:1]
+    """Return which prisms are not measured: those that the pose names, else those of stations in trouble, else the oldest."""
+    troubled = {number for number, found in conditions.items() if not found.ok}
+    missing = (
+        [each for each in pose.stations if each.reason]
+        or [each for each in pose.stations if each.id in troubled]
+        or sorted(pose.stations, key=lambda each: -math.inf if each.age_s is None else -each.age_s)[:1]
+    )
     texts = []
     for each in missing:
         found = conditions.get(each.id)
-        age = "" if each.age_s is None else f" for {each.age_s:.0f} s"
+        age = (
+            ""
+            if each.age_s is None
+            else f" for {each.age_s:.1f} s"
+            if each.age_s < 10
+            else f" for {each.age_s:.0f} s"
+        )
         words = f" ({found.words})" if found is not None and not found.ok else ""
         texts.append(f"station {each.id} has not measured prism {each.prism}{age}{words}")
     return "; ".join(texts)

@@ -231,9 +231,9 @@ class MissionState:
             "pose": self._pose_view(now_s) if live else None,
             "figures": self._figures(now_s) if live else {},
             "stations": self._tiles(now_s) if live else self._silent_tiles(),
-            "imu": findings.imu_view(self._status),
-            "radio": findings.radio_view(self._status, self._setup),
-            **findings.storage_view(self._status, self._setup),
+            "imu": findings.imu_view(self._status) if live else None,
+            "radio": findings.radio_view(self._status, self._setup) if live else None,
+            **(findings.storage_view(self._status, self._setup) if live else {}),
         }
 
     def setup_view(self) -> dict[str, Any] | None:

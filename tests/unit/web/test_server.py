@@ -6,7 +6,10 @@ import asyncio
 import itertools
 import json
 import re
+import shutil
 import socket
+import ssl
+import subprocess
 from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -21,9 +24,13 @@ from tsgt.web import connections, server
 from tsgt.web.access import SECURITY_HEADERS, Access
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import aiohttp
 
 CODE = "correct horse"
+
+OPENSSL = shutil.which("openssl")
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +189,32 @@ async def test_right_cookie_does_not_help_a_foreign_site(access: Access) -> None
             assert got.status == 403
         async with session.get(f"{url}stream", headers=cookie | {"Host": "attacker.example"}) as got:
             assert got.status == 421
+
+
+@pytest.mark.skipif(OPENSSL is None, reason="openssl, which makes the certificate, is not installed")
+def test_tls_with_a_certificate_of_ones_own(tmp_path: Path, access: Access) -> None:
+    """The cookie is then for encrypted connections only, and plain HTTP gets nothing."""
+    certificate, key = tmp_path / "robot.pem", tmp_path / "robot.key"
+    request = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=robot -addext subjectAltName=IP:127.0.0.1"
+    subprocess.run(
+        [str(OPENSSL), *request.split(), "-out", certificate, "-keyout", key], check=True, capture_output=True
+    )
+    trusting = ssl.create_default_context(cafile=str(certificate))
+
+    async def check() -> None:
+        async with served(mission(), access, certificate=certificate, key=key) as url, client() as session:
+            assert url.startswith("https://")
+            headers = {"Origin": url.rstrip("/")}
+            async with session.post(
+                f"{url}login", data={"code": CODE}, headers=headers, allow_redirects=False, ssl=trusting
+            ) as got:
+                assert got.status == 303
+                assert "Secure" in got.headers["Set-Cookie"].split("; ")
+            async with session.get(f"{url}stream", ssl=trusting) as stream:
+                assert (await message(stream))["first"] is True
+            assert await raw(url, f"GET / HTTP/1.1\r\nHost: {host(url)}\r\n\r\n".encode()) == b""
+
+    asyncio.run(check())
 
 
 @in_real_time

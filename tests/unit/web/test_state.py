@@ -108,7 +108,7 @@ def test_missing_prism_is_explained_with_what_its_station_does() -> None:
     lost = pose(10.0, valid=False, reason="outage", quality="invalid", position_m=None, orientation_xyzw=None,
                 covariance=None, stations=shares)  # fmt: skip
     feed(state, status(10.0, station(1), station(2, status=Status.NO_TARGET)), lost, now_s=10.0)
-    assert verdict(state, 10.1) == ("NO POSE", "station 2 has not measured prism 2 for 4 s (no prism)")
+    assert verdict(state, 10.1) == ("NO POSE", "station 2 has not measured prism 2 for 4.2 s (no prism)")
     assert state.view(10.1)["pose"] is None
 
 

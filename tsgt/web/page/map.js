@@ -82,7 +82,7 @@ export class MissionMap {
     this.view = view;
     this.stale = stale;
     if (view && view.pose && view.pose.valid) this.last = view.pose;
-    if (!this.fitted && this.setup && this.last) { this.fit(); if (this.scale < 4) this.scale = 4; }
+    if (!this.fitted && this.setup && (this.last || this.trail.length)) this.fit();
     this.draw();
   }
 

@@ -104,7 +104,7 @@ function show() {
   text(find("words"), now.words);
   text(find("cause"), now.cause);
   document.body.classList.toggle("stale", stale);
-  text(find("time"), view ? clock(view.stamp_ms) : "–");
+  text(find("time"), view ? `${clock(view.stamp_ms)} UTC` : "–");
   text(find("source"), (replaying ? "REPLAY " : "") + (view ? view.source : ""));
   document.title = `${now.words} – tsgt`;
   speak(now, level);
@@ -112,11 +112,11 @@ function show() {
   showAlarms(live ? live.alarms : []);
   showFigures(live && !stale ? live.figures : {});
   showStations(live ? live.stations : (view ? view.stations.map(({ id }) => ({ id, state: "unknown", words: "unknown" })) : []));
-  showFacts(live);
+  showFacts(live && !stale ? live : null);
   if (live) map.update(live, stale); else map.update(view && { ...view, pose: null, stations: [] }, true);
   find("map").setAttribute("aria-label", mapText(live));
   const prisms = drawChart(find("chart"), residuals, view ? view.now_s : 0, view && view.figures.residual_limit_mm);
-  showLegend(prisms);
+  showLegend(prisms, stale);
 }
 
 function text(element, content) {
@@ -245,7 +245,7 @@ function showFacts(live) {
   const facts = [];
   if (live && live.recording) {
     const { file, bytes: size, write_age_s } = live.recording;
-    facts.push(["recording", [file || "none", size ? bytes(size) : "", write_age_s !== null && write_age_s !== undefined ? `written ${write_age_s.toFixed(0)} s ago` : ""].filter(Boolean).join(", "), live.recording.bad]);
+    facts.push(["recording", [file || "none", size ? bytes(size) : "", write_age_s > 2 ? `written ${write_age_s.toFixed(0)} s ago` : ""].filter(Boolean).join(", "), live.recording.bad]);
   }
   if (live && live.disk) facts.push(["disk", `${bytes(live.disk.free_bytes)} free of ${bytes(live.disk.total_bytes)}`, live.disk.bad]);
   if (live && live.radio && live.radio.protocol) {
@@ -269,14 +269,14 @@ function showEvents() {
   if (!events.length) child(list, "li", "none yet");
 }
 
-function showLegend(prisms) {
+function showLegend(prisms, stale) {
   const legend = find("legend"), key = prisms.join();
   if (legend.dataset.key !== key) {
     legend.dataset.key = key;
     legend.replaceChildren();
     for (const prism of prisms) child(legend, "span", "", `c${Number(prism) % 4}`);
   }
-  const last = residuals.length ? residuals[residuals.length - 1][1] : {};
+  const last = residuals.length && !stale ? residuals[residuals.length - 1][1] : {};
   prisms.forEach((prism, index) => text(legend.children[index], `prism ${prism}: ${last[prism] === undefined ? "–" : length(last[prism])}`));
   find("chart").setAttribute("aria-label", `Residuals: ${legend.textContent}`);
 }

@@ -1,0 +1,162 @@
+"""The operator's page with five browsers: processor time and memory of `tsgt web`, and what it costs the stream's server.
+
+A recording's lines are served on a socket at their pace, first without `tsgt web`, then with it, five readers of the page and one
+that stalls. All readers are in a process of their own.
+
+    tsgt simulate dynamic --duration 640 --seed 1 --output R.jsonl
+    python benchmarks/run.py web R.jsonl --seconds 600
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import re
+import socket
+import statistics
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import aiohttp
+
+from tsgt.master.stream_server import StreamServer
+from tsgt.recording import HelloRecord, encode_line
+from tsgt.web.recorded import index_of
+
+BROWSERS = 5
+BASELINE_S = 60.0
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--seconds", type=float, default=600.0)
+    options = parser.parse_args()
+    with ProcessPoolExecutor(1) as pool:
+        asyncio.run(measure(options.recording, options.seconds, pool))
+
+
+async def measure(recording: Path, seconds: float, pool: ProcessPoolExecutor) -> None:
+    """Serve the stream, without the page and with it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.sock"
+        async with StreamServer(path, encode_line(HelloRecord())) as server:
+            play = asyncio.create_task(serve(server, recording))
+            baseline_s = min(BASELINE_S, seconds)
+            before = await share(os.getpid(), baseline_s)
+            program = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-m",
+                "tsgt",
+                "web",
+                "--socket",
+                str(path),
+                "--port",
+                "0",
+                stderr=asyncio.subprocess.PIPE,
+            )
+            try:
+                url = await address(program)
+                readers = asyncio.get_running_loop().run_in_executor(pool, read_all, url, seconds)
+                await asyncio.sleep(1)
+                with_page, page = await asyncio.gather(
+                    share(os.getpid(), seconds - 2), share(program.pid, seconds - 2)
+                )
+                peak_mb, now_mb = memory_mb(program.pid)
+                gaps = await readers
+            finally:
+                program.kill()
+                await program.wait()
+                play.cancel()
+                await asyncio.gather(play, return_exceptions=True)
+    print(f"{seconds:.0f} s, {BROWSERS} readers and a stalled one")
+    print(f"tsgt web: {100 * page:.2f} % of a core, {now_mb:.1f} MB, at most {peak_mb:.1f} MB")
+    print(f"server of the stream: {100 * before:.2f} % of a core without it, {100 * with_page:.2f} % with it")
+    ordered = sorted(gaps)
+    print(
+        f"messages of the readers: {len(gaps)}, gaps median {1e3 * statistics.median(gaps):.0f} ms, "
+        f"99 % {1e3 * ordered[int(0.99 * len(ordered))]:.0f} ms, most {1e3 * ordered[-1]:.0f} ms"
+    )
+
+
+async def address(program: asyncio.subprocess.Process) -> str:
+    """Return where the page is, as the program prints it."""
+    while program.stderr is not None and (line := await program.stderr.readline()):
+        if found := re.match(r"the page is at (\S+)", line.decode()):
+            return found[1]
+    sys.exit("tsgt web has ended")
+
+
+async def serve(server: StreamServer, recording: Path) -> None:
+    """Publish the lines of a recording at their pace."""
+    index = index_of(recording)
+    server.publish(index.setups[0][1].strip())
+    start_s = time.monotonic()
+    for at_s, line in index.lines(0.0):
+        if at_s > (now_s := time.monotonic() - start_s):
+            await asyncio.sleep(at_s - now_s)
+        if not line.startswith((b'{"type":"recording"', b'{"type":"parameters"')):
+            server.publish(line.strip())
+
+
+async def share(process: int, seconds: float) -> float:
+    """Return the share of a core that a process takes."""
+    before, start_s = cpu_s(process), time.monotonic()
+    await asyncio.sleep(seconds)
+    return (cpu_s(process) - before) / (time.monotonic() - start_s)
+
+
+def cpu_s(process: int) -> float:
+    """Return the processor time of a process so far."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+
+
+def memory_mb(process: int) -> tuple[float, float]:
+    """Return the largest and the present resident memory of a process."""
+    text = Path(f"/proc/{process}/status").read_text()
+    peak, now = (int(re.findall(rf"{name}:\s+(\d+)", text)[0]) / 1024 for name in ("VmHWM", "VmRSS"))
+    return peak, now
+
+
+def read_all(url: str, seconds: float) -> list[float]:
+    """Return the times between messages, as five readers get them, beside one that stalls."""
+    return asyncio.run(_read_all(url, seconds))
+
+
+async def _read_all(url: str, seconds: float) -> list[float]:
+    host = urlsplit(url)
+    stalled = socket.socket()
+    stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    stalled.connect((host.hostname, host.port))
+    stalled.send(f"GET /stream HTTP/1.1\r\nHost: {host.netloc}\r\n\r\n".encode())
+    async with aiohttp.ClientSession() as session:
+        found = await asyncio.gather(*(_read(session, url, seconds) for _ in range(BROWSERS)))
+    stalled.close()
+    return [gap for gaps in found for gap in gaps]
+
+
+async def _read(session: aiohttp.ClientSession, url: str, seconds: float) -> list[float]:
+    times: list[float] = []
+    end_s = time.monotonic() + seconds
+    async with session.get(f"{url}stream", timeout=aiohttp.ClientTimeout()) as response:
+        while time.monotonic() < end_s:
+            line = await response.content.readuntil(b"\n\n")
+            if "view" in json.loads(line.removeprefix(b"data: ")):
+                times.append(time.monotonic())
+    return [b - a for a, b in pairwise(times)]
+
+
+if __name__ == "__main__":
+    sys.exit("run it by its name: python benchmarks/run.py web")

@@ -18,7 +18,7 @@ from tsgt.imu import HelloLine, SamplesLine, decode_program_line
 if TYPE_CHECKING:
     from types import ModuleType
 
-NODE = Path(__file__).parents[2] / "integrations" / "ros2" / "imu_lines.py"
+NODE = Path(__file__).parents[2] / "integrations" / "ros2" / "tsgt_ros2" / "imu_lines.py"
 
 RCLPY = """
 from types import SimpleNamespace as N

@@ -31,6 +31,7 @@ from tsgt.client.records import (
     StationStatus,
     Status,
     ValidityLimits,
+    monotonic_ns,
 )
 from tsgt.client.relay_wire import AuthenticationError
 from tsgt.client.stream import LIVE, default_max_age_s
@@ -65,6 +66,7 @@ __all__ = [
     "ValidityLimits",
     "default_max_age_s",
     "measured_point",
+    "monotonic_ns",
 ]
 
 

@@ -1,0 +1,1 @@
+"""Nodes between tsgt and ROS 2."""

@@ -29,7 +29,7 @@ MAX_GAP_S = 0.5
 WINDOW_S = 10.0  # In which the measurements are compared with the trajectory
 MAX_SQUARE = 9.0  # Of a normalised residual: one outlier does not condemn the IMU
 MAX_MEAN_SQUARE = 2.5
-"""Mean square of the normalised residuals, 1 if samples and measurements agree. A mounting 2 degrees off makes it 6."""
+"""Mean square of the normalised residuals, 1 if samples and measurements agree."""
 MIN_COMPONENTS = 24  # Of residuals in a window: eight measurements
 MAX_CONTRADICTED = 0.5  # Share of the windows beyond which the IMU is not used at all
 

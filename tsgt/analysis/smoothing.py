@@ -272,9 +272,12 @@ class _PoseSeries:
         for start in range(0, max(len(epochs_ns), 1), _EPOCHS_PER_CHUNK):
             some_ns = epochs_ns[start : start + _EPOCHS_PER_CHUNK]
             time_s = (some_ns - self._origin_ns) / 1e9
-            states, covariance = found.trajectory.at(time_s, dim=_POSE_DIM)
-            common = found.trajectory.common_at(time_s, dim=_POSE_DIM)
-            converged = None if imu is None else ~imu.unused_at(time_s)
+            if imu is None:
+                states, covariance = found.trajectory.at(time_s, dim=_POSE_DIM)
+                common, converged = found.trajectory.common_at(time_s, dim=_POSE_DIM), None
+            else:
+                states, covariance, common = imu.fit.trajectory.poses_at(time_s)
+                converged = ~imu.unused_at(time_s)
             chunks.append(
                 output.smoothed(some_ns, seen, states, covariance, common=common, converged=converged)
             )

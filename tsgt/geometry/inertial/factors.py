@@ -93,10 +93,12 @@ class InertialFactors:
         *,
         gyro_only: MotionPrior | None = None,
         odometry: Odometry | None = None,
+        found: Preintegrated | None = None,
     ) -> InertialFactors:
-        """Preintegrate from N states to N later times."""
-        bias = np.zeros(3) if gyro_only else earlier.bias_or_acceleration
-        found = preintegrate(samples, earlier.time_s, end_s, earlier.gyro_bias, bias)
+        """Preintegrate from N states to N later times, unless that is ``found`` already."""
+        if found is None:
+            bias = np.zeros(3) if gyro_only else earlier.bias_or_acceleration
+            found = preintegrate(samples, earlier.time_s, end_s, earlier.gyro_bias, bias)
         walks = np.array([noise.gyro_bias_walk, noise.accelerometer_bias_walk])
         walk_information = 1.0 / (walks**2 * found.duration_s[:, None])
         driven = None

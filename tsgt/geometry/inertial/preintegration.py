@@ -49,11 +49,16 @@ class ContiguousSamples:
 
     def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Angular rate and specific force at M instants, (M, 3) each: linear between the middles of the samples."""
-        middle_s = 0.5 * (self.bounds_s[:-1] + self.bounds_s[1:])
-        later = np.clip(np.searchsorted(middle_s, time_s), 1, max(len(self) - 1, 1))
+        inside = np.clip(np.searchsorted(self.bounds_s, time_s) - 1, 0, len(self) - 1)
+        # Not of all samples: few times are asked for at once.
+        after_middle = 0.5 * (self.bounds_s[inside] + self.bounds_s[inside + 1]) < time_s
+        later = np.clip(inside + after_middle, 1, max(len(self) - 1, 1))
         earlier, later = later - 1, np.minimum(later, len(self) - 1)
-        step_s = np.where(later > earlier, middle_s[later] - middle_s[earlier], 1.0)
-        share = np.clip((time_s - middle_s[earlier]) / step_s, 0.0, 1.0)[:, None]
+        earlier_s, later_s = (
+            0.5 * (self.bounds_s[rows] + self.bounds_s[rows + 1]) for rows in (earlier, later)
+        )
+        step_s = np.where(later > earlier, later_s - earlier_s, 1.0)
+        share = np.clip((time_s - earlier_s) / step_s, 0.0, 1.0)[:, None]
         rate, force = (
             values[earlier] + share * (values[later] - values[earlier])
             for values in (self.angular_rate_radps, self.specific_force_mps2)

@@ -97,14 +97,25 @@ class InertialTrajectory:
 
         ``dim``: 6. Angular accelerations are zero: no sample tells them. Raises GeometryError: a time is outside the knots.
         """
-        found = self._in_chunks(time_s, common=False)
-        return found[0], found[1][:, :dim, :dim]
+        states, covariance, _ = self._in_chunks(time_s, common=False)
+        return states, covariance[:, :dim, :dim]
 
     def common_at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> FloatArray | None:
         """Return the (N, 6, 6) covariance of poses at N times that the set-up's uncertainty adds; None: unknown."""
-        return None if self.displacement is None else self._in_chunks(time_s, common=True)[1][:, :dim, :dim]
+        if self.displacement is None:
+            return None
+        _, _, common = self._in_chunks(time_s, random=False)
+        return common[:, :dim, :dim]
 
-    def _in_chunks(self, time_s: FloatArray, *, common: bool) -> tuple[States, FloatArray]:
+    def poses_at(self, time_s: FloatArray) -> tuple[States, FloatArray, FloatArray | None]:
+        """Return what :meth:`at` and :meth:`common_at` do, in half the time."""
+        if self.displacement is None:
+            return (*self.at(time_s), None)
+        return self._in_chunks(time_s)
+
+    def _in_chunks(
+        self, time_s: FloatArray, *, random: bool = True, common: bool = True
+    ) -> tuple[States, FloatArray, FloatArray]:
         knots_s = self.knots.time_s
         if len(time_s) and not (knots_s[0] <= time_s.min() and time_s.max() <= knots_s[-1]):
             raise GeometryError(
@@ -112,15 +123,15 @@ class InertialTrajectory:
                 f"asked for {time_s.min():.3f} to {time_s.max():.3f} s"
             )
         found = [
-            self._at(time_s[i : i + _CHUNK], common=common) for i in range(0, max(len(time_s), 1), _CHUNK)
+            self._at(time_s[i : i + _CHUNK], random=random, common=common)
+            for i in range(0, max(len(time_s), 1), _CHUNK)
         ]
         if len(found) == 1:
             return found[0]
-        return concatenate_states([states for states, _ in found]), np.concatenate(
-            [each for _, each in found]
-        )
+        states, covariances, commons = zip(*found, strict=True)
+        return concatenate_states(list(states)), np.concatenate(covariances), np.concatenate(commons)
 
-    def _at(self, time_s: FloatArray, *, common: bool) -> tuple[States, FloatArray]:
+    def _at(self, time_s: FloatArray, *, random: bool, common: bool) -> tuple[States, FloatArray, FloatArray]:
         knot = np.clip(np.searchsorted(self.knots.time_s, time_s, side="right") - 1, 0, len(self.knots) - 2)
         rows, index = np.unique(knot, return_inverse=True)
         earlier, later = self.knots.select(knot), self.knots.select(knot + 1)
@@ -135,11 +146,12 @@ class InertialTrajectory:
             )
         by_error = self._to_reference(rotation)
         by_earlier, by_later = by_error @ by_earlier, by_error @ by_later
+        covariance = by_common = np.zeros((len(time_s), 0, 0))
         if common:
             assert self.displacement is not None  # noqa: S101 (the caller checks)
             displaced = by_earlier @ self.displacement[knot] + by_later @ self.displacement[knot + 1]
-            covariance = displaced @ np.swapaxes(displaced, 1, 2)
-        else:
+            by_common = displaced @ np.swapaxes(displaced, 1, 2)
+        if random:
             coupling = by_earlier @ self.cross_covariance[knot] @ np.swapaxes(by_later, 1, 2)
             covariance = (
                 by_earlier @ self.covariance[knot] @ np.swapaxes(by_earlier, 1, 2)
@@ -150,7 +162,8 @@ class InertialTrajectory:
             )
             covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
         rate = self.samples.at(time_s)[0] - earlier.gyro_bias
-        return self._reference_states(time_s, position, rotation, velocity, acceleration, rate), covariance
+        states = self._reference_states(time_s, position, rotation, velocity, acceleration, rate)
+        return states, covariance, by_common
 
     def _inertial(
         self,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import GeometryError
+from tsgt.geometry.inertial.factors import InertialFactors
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading, states_on_tracks
 from tsgt.geometry.inertial.odometry import Odometry
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.inertial.initialisation import HeadingSearch
     from tsgt.geometry.inertial.odometry import OdometrySamples
+    from tsgt.geometry.inertial.preintegration import Preintegrated
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.inertial.solver import InertialSolution
     from tsgt.geometry.rigid import FloatArray
@@ -133,10 +135,20 @@ def fit_inertial_trajectory(
         solved = slice(*np.searchsorted(time_s, (start_s, np.nextafter(end_s, np.inf))))
         rows = slice(*np.searchsorted(knot_index, (solved.start, solved.stop)))
         some = mounted.select(rows)
-        guess = extended(near, time_s[solved], some, setup)
+        guess, preintegrated = extended(near, time_s[solved], some, setup)
         if wheels is not None:
             guess = guess.with_wheels()
-        return solve_inertial(some, replace(setup, odometry=wheels), guess, gravity), some, solved.start
+        factors = InertialFactors.between(
+            setup.samples,
+            guess.select(slice(None, -1)),
+            guess.time_s[1:],
+            noise,
+            gyro_only=gyro_only,
+            odometry=wheels,
+            found=preintegrated,
+        )
+        found = solve_inertial(some, replace(setup, odometry=wheels), guess, gravity, factors=factors)
+        return found, some, solved.start
 
     first = int(np.clip(np.searchsorted(edges_s, near.time_s[0], side="right") - 1, 0, count - 1))
     while (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
@@ -254,8 +266,8 @@ def find_start(
 
 def extended(
     near: InertialStates, time_s: FloatArray, observations: Observations, setup: InertialSetup
-) -> InertialStates:
-    """Guess states at times, (K,), from others close to them, forwards and backwards.
+) -> tuple[InertialStates, Preintegrated]:
+    """Guess states at times, (K,), from others close to them, forwards and backwards, and the motions between them.
 
     The gyro turns the nearest of the others, and the tracks of the prisms place the states.
     """
@@ -271,4 +283,4 @@ def extended(
         rotation[step + 1] = rotation[step] @ found.rotation[step]
     for step in range(first - 1, -1, -1):
         rotation[step] = rotation[step + 1] @ found.rotation[step].T
-    return states_on_tracks(observations, time_s, rotation, gyro_bias)
+    return states_on_tracks(observations, time_s, rotation, gyro_bias), found

@@ -125,9 +125,15 @@ def test_displacement_by_the_setup() -> None:
     count = len(trajectory.knots)
     displacement = np.zeros((count, 15, 1))
     displacement[:, :3, 0] = [0.003, 0.0, 0.001]
-    common = replace(trajectory, displacement=displacement).common_at(QUERIES_S)
+    displaced = replace(trajectory, displacement=displacement)
+    common = displaced.common_at(QUERIES_S)
     expected: FloatArray = np.zeros((6, 6))
     expected[:3, :3] = np.outer([0.003, 0.0, 0.001], [0.003, 0.0, 0.001])
     assert common is not None
     np.testing.assert_allclose(common, np.broadcast_to(expected, common.shape), atol=1e-9)
     assert trajectory.common_at(QUERIES_S) is None
+    states, covariance, together = displaced.poses_at(QUERIES_S)
+    np.testing.assert_array_equal(together, common)
+    np.testing.assert_array_equal(covariance, trajectory.at(QUERIES_S)[1])
+    np.testing.assert_array_equal(states.position, trajectory.at(QUERIES_S)[0].position)
+    assert trajectory.poses_at(QUERIES_S)[2] is None

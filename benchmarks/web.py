@@ -1,9 +1,9 @@
 """The operator's page with five browsers: processor time and memory of `tsgt web`, and what it costs the stream's server.
 
-A recording's lines are served on a socket at their pace, first without `tsgt web`, then with it, five readers of the page and one
+A recording's lines are served on a socket at their pace, again and again, first without `tsgt web`, then with it, five readers of the page and one
 that stalls. All readers are in a process of their own.
 
-    tsgt simulate dynamic --duration 640 --seed 1 --output R.jsonl
+    tsgt simulate dynamic --duration 180 --seed 1 --output R.jsonl
     python benchmarks/run.py web R.jsonl --seconds 600
 """
 
@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -31,6 +31,7 @@ from tsgt.recording import HelloRecord, encode_line
 from tsgt.web.recorded import index_of
 
 BROWSERS = 5
+STAMP = re.compile(rb'("stamp_ns":)(\d+)')
 BASELINE_S = 60.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
@@ -99,15 +100,23 @@ async def address(program: asyncio.subprocess.Process) -> str:
 
 
 async def serve(server: StreamServer, recording: Path) -> None:
-    """Publish the lines of a recording at their pace."""
+    """Publish the lines of a recording at their pace, again and again, with times that go on."""
     index = index_of(recording)
     server.publish(index.setups[0][1].strip())
     start_s = time.monotonic()
-    for at_s, line in index.lines(0.0):
-        if at_s > (now_s := time.monotonic() - start_s):
-            await asyncio.sleep(at_s - now_s)
-        if not line.startswith((b'{"type":"recording"', b'{"type":"parameters"')):
-            server.publish(line.strip())
+    for number in count():
+        played_s = number * index.length_s
+        for at_s, line in index.lines(0.0):
+            if played_s + at_s > (now_s := time.monotonic() - start_s):
+                await asyncio.sleep(played_s + at_s - now_s)
+            if line.startswith((b'{"type":"recording"', b'{"type":"parameters"', b'{"type":"setup"')):
+                continue
+            server.publish(later(line.strip(), round(played_s * 1e9)))
+
+
+def later(line: bytes, by_ns: int) -> bytes:
+    """Return a line with a later time."""
+    return STAMP.sub(lambda found: b"%s%d" % (found[1], int(found[2]) + by_ns), line, count=1)
 
 
 async def share(process: int, seconds: float) -> float:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from harness.browser import CHROMIUM, Tab, browser
-from harness.records import EVENT
+from harness.records import EVENT, HEADER, PARAMETERS
 from harness.scripted_mission import scripted_mission
-from harness.web import in_real_time
+from harness.web import in_real_time, pose, status
 
 from tsgt.model import Status
 from tsgt.recording import encode_line
@@ -60,19 +60,10 @@ FAULTS: list[tuple[dict[str, Any], str, str]] = [
 
 
 @asynccontextmanager
-async def web(socket: Path, port: str = "0") -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
+async def web(*options: str | Path, port: str = "0") -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
     """Start the program; give process and address."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-m",
-        "tsgt",
-        "web",
-        "--socket",
-        str(socket),
-        "--port",
-        port,
-        stderr=asyncio.subprocess.PIPE,
-    )
+    arguments = [sys.executable, "-m", "tsgt", "web", "--port", port, *map(str, options)]
+    process = await asyncio.create_subprocess_exec(*arguments, stderr=asyncio.subprocess.PIPE)
     assert process.stderr is not None
     try:
         async with asyncio.timeout(START_S):
@@ -103,7 +94,7 @@ async def test_page_follows_each_fault_within_two_seconds(tmp_path: Path) -> Non
 
     async with AsyncExitStack() as stack:
         window = await stack.enter_async_context(browser())
-        _, url = await stack.enter_async_context(web(socket))
+        _, url = await stack.enter_async_context(web("--socket", socket))
         tabs = [await stack.enter_async_context(window.tab(url, *size)) for size in SIZES]
         async with scripted_mission(socket) as mission:
             await shown(tabs, words_are("GOOD"), START_S)
@@ -143,7 +134,7 @@ async def test_page_without_its_server_is_no_green(tmp_path: Path) -> None:
     async with (
         browser() as window,
         scripted_mission(socket),
-        web(socket) as (process, url),
+        web("--socket", socket) as (process, url),
         window.tab(url) as tab,
     ):
         await tab.wait(words_are("GOOD"), START_S)
@@ -154,15 +145,75 @@ async def test_page_without_its_server_is_no_green(tmp_path: Path) -> None:
         process.kill()
         await tab.wait(words_are("NO CONNECTION"), FOLLOWS_S)
         assert await tab.run("document.querySelector('#f-sigma b').textContent") == NOTHING
-        async with web(socket, url.rsplit(":", 1)[1].strip("/")):
+        async with web("--socket", socket, port=url.rsplit(":", 1)[1].strip("/")):
             await tab.wait(words_are("GOOD"), START_S)
+
+
+@needs_chromium
+@in_real_time
+async def test_code_and_keys_in_a_browser(tmp_path: Path) -> None:
+    """The form sends the code as a browser does, with its origin; then keys steer map and colours."""
+    code = tmp_path / "web.code"
+    code.write_text("abcdefghjk23")
+    code.chmod(0o600)
+    async with (
+        browser() as window,
+        web("--socket", tmp_path / "none.sock", "--code-file", code) as (_, url),
+        window.tab(url) as tab,
+    ):
+        field = "document.getElementById('code')"
+        for given, then in (
+            ("wrong code", "innerText.includes('Wrong code')"),
+            ("abcdefghjk23", "dataset.replay === 'no'"),
+        ):
+            await tab.wait(f"{field} !== null", START_S)
+            await tab.run(f"{field}.value = {given!r}; {field}.form.requestSubmit()")
+            await tab.wait(f"document.body?.{then}", START_S)
+        await tab.wait(words_are("STREAM STOPPED", "does tsgt-master run?"), START_S)
+        assert await tab.run("document.cookie") == ""
+        for key, state in (
+            ("f", "document.getElementById('follow').ariaPressed === 'false'"),
+            ("n", "document.getElementById('north').textContent === 'Heading up'"),
+            ("t", "document.documentElement.dataset.theme === 'light'"),
+            ("t", "document.documentElement.dataset.theme === 'dark'"),
+        ):
+            await tab.run(
+                f"document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: {key!r}, bubbles: true}}))"
+            )
+            assert await tab.run(state), key
+
+
+@needs_chromium
+@in_real_time
+async def test_recording_with_its_time_bar(tmp_path: Path) -> None:
+    """It plays; the bar seeks, the button pauses, and a paused replay is no lost connection."""
+    records = [HEADER, PARAMETERS]
+    for step in range(600):
+        records += [pose(step / 10, position_m=(step / 20, 5.0, 0.0))] + (
+            [status(step / 10)] if step % 10 == 0 else []
+        )
+    path = tmp_path / "drive.jsonl"
+    path.write_bytes(b"".join(encode_line(record) + b"\n" for record in records))
+    async with browser() as window, web("--replay", path) as (_, url), window.tab(url) as tab:
+        await tab.wait(words_are("GOOD"), START_S)
+        await tab.run(
+            "let at = document.getElementById('at'); at.value = 40; at.dispatchEvent(new Event('input'))"
+        )
+        await tab.wait("document.getElementById('at-text').textContent.startsWith('0:41')", START_S)
+        await tab.run("document.getElementById('play').click()")
+        await tab.wait("document.getElementById('play').textContent === 'Play'", START_S)
+        before = await tab.run("document.getElementById('at-text').textContent")
+        await asyncio.sleep(FOLLOWS_S)
+        assert await tab.run("document.getElementById('at-text').textContent") == before
+        assert await tab.run(words_are("GOOD"))
+        assert tab.problems == []
 
 
 @in_real_time
 async def test_program_is_small_and_ends_when_told(tmp_path: Path) -> None:
     """A mission's minute fits into 60 MB, without numpy; SIGTERM ends it at once, with exit code 0."""
     socket = tmp_path / "poses.sock"
-    async with scripted_mission(socket), web(socket) as (process, url):
+    async with scripted_mission(socket), web("--socket", socket) as (process, url):
         reader, writer = await asyncio.open_connection("127.0.0.1", int(url.rsplit(":", 1)[1].strip("/")))
         writer.write(f"GET /stream HTTP/1.1\r\nHost: {url.split('/')[2]}\r\n\r\n".encode())
         for _ in range(10):

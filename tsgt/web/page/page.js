@@ -243,9 +243,9 @@ function bytes(count) {
 
 function showFacts(live) {
   const facts = [];
-  if (live && live.recording) {
+  if (live && live.recording && live.recording.file) {
     const { file, bytes: size, write_age_s } = live.recording;
-    facts.push(["recording", [file || "none", size ? bytes(size) : "", write_age_s > 2 ? `written ${write_age_s.toFixed(0)} s ago` : ""].filter(Boolean).join(", "), live.recording.bad]);
+    facts.push(["recording", [file, size ? bytes(size) : "", write_age_s > 2 ? `written ${write_age_s.toFixed(0)} s ago` : ""].filter(Boolean).join(", "), live.recording.bad]);
   }
   if (live && live.disk) facts.push(["disk", `${bytes(live.disk.free_bytes)} free of ${bytes(live.disk.total_bytes)}`, live.disk.bad]);
   if (live && live.radio && live.radio.protocol) {

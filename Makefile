@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 # Property tests of everything that takes bytes from outside.
-FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic damaged_files damaged_recordings \
+FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic client damaged_files damaged_recordings \
 	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
 	superframe_messages tum))
 

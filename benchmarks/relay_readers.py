@@ -13,11 +13,12 @@ import argparse
 import asyncio
 import os
 import re
+import socket
 import subprocess
 import sys
 import tempfile
 import time
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 
 from tsgt.client import AsyncStream
@@ -29,23 +30,22 @@ CERTIFICATE = (
 )
 
 
-async def arrivals(stream: AsyncStream, until_s: float) -> dict[int, float]:
+async def arrivals(stream: AsyncStream, seconds: float) -> dict[int, float]:
     """Return when each predicted pose arrived."""
     found: dict[int, float] = {}
-    async for pose in stream.poses("predicted", include_invalid=True):
-        found[pose.stamp_ns] = time.monotonic()
-        if time.monotonic() > until_s:
-            break
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            async for pose in stream.poses("predicted", include_invalid=True):
+                found[pose.stamp_ns] = time.monotonic()
     return found
 
 
-async def measure(source: str, socket: Path, key: Path, readers: int, seconds: float) -> list[float]:
+async def measure(source: str, path: Path, key: Path, readers: int, seconds: float) -> list[float]:
     """Return the added delays in ms."""
     async with AsyncExitStack() as stack:
-        direct = await stack.enter_async_context(AsyncStream(socket))
+        direct = await stack.enter_async_context(AsyncStream(path))
         relayed = [await stack.enter_async_context(AsyncStream(source, key=key)) for _ in range(readers)]
-        until_s = time.monotonic() + seconds
-        first, *others = await asyncio.gather(*(arrivals(stream, until_s) for stream in (direct, *relayed)))
+        first, *others = await asyncio.gather(*(arrivals(stream, seconds) for stream in (direct, *relayed)))
     return sorted(
         (other[stamp] - at) * 1e3 for other in others for stamp, at in first.items() if stamp in other
     )
@@ -72,7 +72,7 @@ def main() -> None:
             "--listen", f"127.0.0.1:{PORT}", *(tls if options.tls else []),
         ]  # fmt: skip
         with subprocess.Popen(command, stderr=subprocess.DEVNULL) as relay:
-            time.sleep(2)
+            wait_for(PORT)
             before = processor_s(relay.pid)
             source = f"relay{'s' if options.tls else ''}://127.0.0.1:{PORT}"
             delays = asyncio.run(
@@ -91,6 +91,14 @@ def main() -> None:
     print(
         f"added delay          median {delays[len(delays) // 2]:.2f} ms, p99 {delays[len(delays) * 99 // 100]:.2f} ms"
     )
+
+
+def wait_for(port: int) -> None:
+    """Return when the relay listens."""
+    while True:
+        with suppress(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port)):
+            return
+        time.sleep(0.1)
 
 
 def processor_s(process: int) -> float:

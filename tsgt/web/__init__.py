@@ -2,7 +2,7 @@
 
 In: the lines of the stream (`source`), or a recording (`recorded`, `replay`). Out: messages for the page (`live`, `messages`), five a
 second, over HTTP (`server`, with the limits of `connections` and the rules of `access`). What the page shows is decided in `state`
-with `verdict`, `mission_findings`, `stations` and `history`, which are sans-I/O; `page` holds the files that the browser gets.
+with `verdict`, `mission_findings`, `figures`, `stations` and `history`, which are sans-I/O; `page` holds the files that the browser gets.
 
 The face exports nothing: the server needs aiohttp, the rest does not. No file here needs numpy.
 """

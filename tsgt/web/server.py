@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import logging
 import socket
 import ssl
 from contextlib import aclosing, suppress
@@ -123,6 +124,9 @@ class Page:
             for name in ("Allow", "Location", "Retry-After"):
                 if name in refusal.headers:
                     response.headers[name] = refusal.headers[name]
+        except Exception as error:  # noqa: BLE001 (a defect costs one request, not the page)
+            log.error("web_request_failed", path=request.path, error=repr(error))  # noqa: TRY400 (aiohttp would print a traceback as well)
+            response = web.Response(status=500, text="500 Internal Server Error\n")
         if not response.prepared:
             _protect(response)
         return response
@@ -284,6 +288,7 @@ async def serve(page: Page, opened: Callable[[str], None]) -> None:
     runner = web.AppRunner(
         page.application(),
         access_log=None,
+        logger=_silent_logger(),
         handler_cancellation=True,
         shutdown_timeout=0.5,
         lingering_time=0.0,
@@ -316,6 +321,13 @@ async def serve(page: Page, opened: Callable[[str], None]) -> None:
             await asyncio.Event().wait()
     finally:
         await runner.cleanup()
+
+
+def _silent_logger() -> logging.Logger:
+    """Return a logger that drops everything: aiohttp prints a traceback for each malformed request."""
+    logger = logging.getLogger("tsgt.web.aiohttp")
+    logger.disabled = True
+    return logger
 
 
 def _tls(settings: Settings) -> ssl.SSLContext | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 import structlog
 
 from tsgt.recording import MAX_LINE_BYTES
+from tsgt.service import LogLimiter
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,19 +23,20 @@ log = structlog.get_logger()
 
 
 async def follow(path: Path, state: MissionState, clock: Clock) -> NoReturn:
-    """Pass the lines of a stream socket to the state."""
+    """Pass the lines of a stream socket to the state; while there is none, what happened last is the problem."""
+    limiter = LogLimiter()
+    problem = ""
     was_connected = True
     while True:
-        problem = f"no stream at {path}"
         try:
             reader, writer = await asyncio.open_unix_connection(path, limit=MAX_LINE_BYTES)
         except OSError as error:
-            problem += f" ({error.strerror or error}): does tsgt-master run?"
+            problem = problem or f"no stream at {path} ({error.strerror or error}): does tsgt-master run?"
         else:
             log.info("stream_connected", path=str(path))
             was_connected = True
             try:
-                problem = await _read(reader, state, clock)
+                problem = await _read(reader, state, clock, limiter)
             finally:
                 writer.close()
                 with contextlib.suppress(OSError):
@@ -46,14 +48,24 @@ async def follow(path: Path, state: MissionState, clock: Clock) -> NoReturn:
         await clock.sleep_until(clock.monotonic_ns() + round(RETRY_S * 1e9))
 
 
-async def _read(reader: asyncio.StreamReader, state: MissionState, clock: Clock) -> str:
+async def _read(reader: asyncio.StreamReader, state: MissionState, clock: Clock, limiter: LogLimiter) -> str:
     """Read until the end; return why it ended."""
     state.connected(clock.monotonic_ns() / 1e9)
-    try:
-        while line := await reader.readline():
-            state.line(line, clock.monotonic_ns() / 1e9)
-    except ValueError as error:  # no line of the stream, or one without end
-        return f"not a stream of tsgt: {error}"
-    except OSError as error:
-        return f"the stream was lost: {error.strerror or error}"
-    return "the stream has ended: the master was stopped or killed"
+    greeted = False
+    while True:
+        try:
+            line = await reader.readline()
+        except (OSError, ValueError) as error:  # ValueError: a line without end
+            return f"the stream was lost: {error}"
+        if not line:
+            return "the stream has ended: the master was stopped or killed"
+        now_ns = clock.monotonic_ns()
+        try:
+            state.line(line, now_ns / 1e9)
+        except ValueError as error:
+            if not greeted:
+                return f"not a stream of tsgt: {error}"
+            # What is missing then shows by its age.
+            if limiter.allows("stream_line_rejected", now_ns):
+                log.warning("stream_line_rejected", error=str(error))
+        greeted = True

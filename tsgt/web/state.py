@@ -22,7 +22,8 @@ from tsgt.recording import (
 )
 from tsgt.web import mission_findings as findings
 from tsgt.web import stations
-from tsgt.web.frames import add, inverse, product, rotate, subtract, worst_sigma
+from tsgt.web.figures import figures
+from tsgt.web.frames import add, inverse, product, rotate, subtract
 from tsgt.web.history import EVENTS, DelayEstimate, History, Residuals, Share, Trail
 from tsgt.web.stations import rounded
 from tsgt.web.verdict import Finding, Hold, Level, PoseFacts, StreamFacts, judge
@@ -223,13 +224,21 @@ class MissionState:
                 "words": shown.level.words,
                 "cause": shown.cause,
                 "urgent": shown.urgent,
-                "for_s": rounded(now_s - self._hold.since_s, 0),
             },
             "alarms": [
                 {"words": each.level.words, "text": each.cause, "urgent": each.urgent} for each in others[:8]
             ],
             "pose": self._pose_view(now_s) if live else None,
-            "figures": self._figures(now_s) if live else {},
+            "figures": figures(
+                self._live.record if self._live is not None else None,
+                self._recent_smoothed(now_s),
+                self._setup.limits if self._setup is not None else None,
+                self._status,
+                share=self._share.value(now_s),
+                elapsed_s=now_s - self._live_s,
+            )
+            if live
+            else {},
             "stations": self._tiles(now_s) if live else self._silent_tiles(),
             "imu": findings.imu_view(self._status) if live else None,
             "radio": findings.radio_view(self._status, self._setup) if live else None,
@@ -338,29 +347,6 @@ class MissionState:
         q = product(orientation, inverse(point.orientation_xyzw))
         return subtract(position, rotate(q, point.position_m)), q
 
-    def _figures(self, now_s: float) -> dict[str, Any]:
-        live = self._live.record if self._live is not None else None
-        smoothed = self._recent_smoothed(now_s)
-        limits = self._setup.limits if self._setup is not None else None
-        ages = [each.age_s for each in live.stations if each.age_s is not None] if live is not None else []
-        status = self._status
-        return {
-            "live": _sigmas(live),
-            "smoothed": _sigmas(smoothed),
-            "delay_s": smoothed.delay_s if smoothed is not None else None,
-            "kind": live.kind if live is not None else None,
-            "sigma_limit_mm": None if limits is None else _mm(limits.predicted_position_sigma_m),
-            "smoothed_limit_mm": None if limits is None else _mm(limits.position_sigma_m),
-            "residual_mm": None if live is None else _mm(live.residual_m),
-            "residual_limit_mm": None if limits is None else _mm(limits.residual_m),
-            "valid_share": rounded(self._share.value(now_s), 3),
-            "poses": status.poses if status is not None else None,
-            "valid_poses": status.valid_poses if status is not None else None,
-            "data_age_s": rounded(min(ages) + now_s - self._live_s, 2) if ages else None,
-            "oldest_age_s": rounded(max(ages) + now_s - self._live_s, 2) if ages else None,
-            "outage_limit_s": None if limits is None else limits.outage_s,
-        }
-
     def _tiles(self, now_s: float) -> list[dict[str, Any]]:
         if self._status is None:
             return []
@@ -391,19 +377,6 @@ class MissionState:
 def plain(text: str) -> str:
     """Return text from outside in one line of bounded length, without control characters."""
     return "".join(sign if sign.isprintable() else " " for sign in text[:MAX_TEXT])
-
-
-def _sigmas(record: PoseRecord | None) -> dict[str, float | None] | None:
-    if record is None or record.covariance is None:
-        return None
-    return {
-        "position_mm": rounded(1e3 * worst_sigma(record.covariance, 0), 1),
-        "rotation_deg": rounded(math.degrees(worst_sigma(record.covariance, 3)), 2),
-    }
-
-
-def _mm(length_m: float | None) -> float | None:
-    return None if length_m is None else rounded(1e3 * length_m, 1)
 
 
 def _without_repetition(items: list[Finding]) -> list[Finding]:

@@ -125,14 +125,11 @@ class Hold:
     def __init__(self) -> None:
         self._shown = GOOD
         self._confirmed_s = float("-inf")
-        self.since_s = float("-inf")
 
     def update(self, verdict: Finding, now_s: float) -> Finding:
         """Take the verdict of now and return the one to show."""
         if verdict.level < self._shown.level and now_s - self._confirmed_s < HOLD_S:
             return self._shown
-        if verdict.level != self._shown.level or self.since_s == float("-inf"):
-            self.since_s = now_s
         self._shown = verdict
         self._confirmed_s = now_s
         return verdict

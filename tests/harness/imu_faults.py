@@ -21,7 +21,7 @@ from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -40,9 +40,10 @@ MAX_NEES, TOLERANCE = 60.0, 0.02
 _PERIOD_NS = 100_000_000
 
 
-def start_confirmed(_work: Callable[[], SetupCheck]) -> Callable[[], SetupCheck]:
-    """Confirm the set-up of the IMU without computing."""
-    return lambda: SetupCheck(confirmed=True)
+def confirm_once() -> StartCheck:
+    """Return what confirms the set-up of the IMU the first time, without computing, and finds nothing later."""
+    checks = iter([SetupCheck(confirmed=True)])
+    return lambda _work: lambda: next(checks, SetupCheck())
 
 
 @dataclass(frozen=True)

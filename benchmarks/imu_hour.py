@@ -45,7 +45,7 @@ def main() -> None:
     error_rad = np.linalg.norm(log_so3(np.swapaxes(rotation, 1, 2) @ found_rotation), axis=1)
     print(
         f"{duration_s:.0f} s: {used.ru_utime + used.ru_stime:.1f} s of CPU ({used.ru_stime:.1f} s system), "
-        f"{used.ru_maxrss / 1024:.0f} MB; {np.count_nonzero(rows)} poses, {1e3 * np.sqrt(np.mean(error_m**2)):.2f} mm and "
+        f"{np.count_nonzero(rows)} poses, {1e3 * np.sqrt(np.mean(error_m**2)):.2f} mm and "
         f"{np.degrees(np.sqrt(np.mean(error_rad**2))):.3f} deg rms at the robot's origin"
     )
 

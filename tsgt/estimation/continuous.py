@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.imu_takeover import ImuTakeover
+from tsgt.estimation.imu_takeover import UNAIDED_S, UNCONFIRMED_SIGMAS, ImuTakeover
 from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
-from tsgt.estimation.pose_batch import Kind, PoseBatch
+from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.setup_uncertainty import setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
@@ -28,6 +28,7 @@ from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
 from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,7 +66,13 @@ class ContinuousEstimator:
         self._imu = (
             None
             if parameters.imu is None
-            else ImuTakeover(parameters.imu, self._without_imu, self._create_with_imu, imu_setup)
+            else ImuTakeover(
+                parameters.imu,
+                self._without_imu,
+                self._create_with_imu,
+                imu_setup,
+                unaided_s=UNAIDED_S if len(layout) >= MIN_PRISMS else 0.0,
+            )
         )
         self._pending: list[Measurement] = []
         none = np.empty(0, np.int64)
@@ -225,7 +232,7 @@ class ContinuousEstimator:
             epochs_ns,
             self._history,
             states,
-            covariance,
+            self._with_allowance(covariance),
             common=np.concatenate(common) if common else None,
             converged=converged,
             ambiguous=ambiguous,
@@ -238,7 +245,14 @@ class ContinuousEstimator:
         """Fill in whether poses rest on the IMU."""
         if self._imu is not None:
             batch.imu[:] = self._imu.use
+            if self._imu.unconfirmed:
+                batch.degraded[batch.valid] |= Degradation.IMU_UNCONFIRMED
         return batch
+
+    def _with_allowance(self, covariance: FloatArray) -> FloatArray:
+        """Return the (N, 6, 6) covariance of poses, with what an unconfirmed set-up of the IMU may have wrong."""
+        unconfirmed = self._imu is not None and self._imu.unconfirmed
+        return covariance + np.diag(UNCONFIRMED_SIGMAS**2) if unconfirmed else covariance
 
     def _with_delayed(self, predicted: PoseBatch) -> PoseBatch:
         """Return predicted poses, each after the smoothed ones whose delay has passed with its epoch."""
@@ -283,7 +297,7 @@ class ContinuousEstimator:
                 stamp_ns,
                 self._history,
                 states,
-                covariance,
+                self._with_allowance(covariance),
                 common=common,
                 converged=reliable & self._window.converged,
                 ambiguous=self._window.recently_ambiguous_at(time_s),

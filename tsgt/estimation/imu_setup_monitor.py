@@ -19,8 +19,9 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.batch import fit_trajectory, scale_noise
-from tsgt.geometry.inertial import Gravity, Mounting, sound_samples
-from tsgt.geometry.inertial_calibration import SetupCheck, check_imu_setup
+from tsgt.geometry.inertial import Gravity, Mounting, fit_inertial_trajectory, sound_samples
+from tsgt.geometry.inertial_calibration import SetupCheck, check_few_prisms, check_imu_setup
+from tsgt.model import MIN_PRISMS
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
@@ -37,6 +38,14 @@ FIRST_NS = 12_000_000_000  # Of measurements before the first check: fewer do no
 UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 INTERVAL_NS = 20_000_000_000
 RESULT_NS = 2_000_000_000  # From the start of a check to its result; a slow computer takes a second
+
+_POSE_DIM = 6
+
+_CONFIRMATION = "mounting, latency, axes and units of the IMU agree with the drive"
+_CONFIRMATION_BY_PRISMS = {
+    1: "position and latency of the IMU agree with the drive; a single prism does not tell its rotation",
+    2: "mounting and latency of the IMU agree with the drive, but for a rotation about the line of both prisms",
+}
 
 _PARTS: dict[Cause, str] = {
     "axes": "axes and units",
@@ -78,6 +87,12 @@ def check_recorded_setup(
     mounting = Mounting(rotation, np.array(imu.position_m) - centroid_m(parameters))
     observations = scale_noise(observations, noise_scales(parameters))
     try:
+        if len(parameters.prisms) < MIN_PRISMS:
+            with_imu = fit_inertial_trajectory(observations, samples, imu, reference_m=centroid_m(parameters))
+            knots = with_imu.trajectory.knots
+            states, _ = with_imu.trajectory.at(knots.time_s, dim=_POSE_DIM)
+            bias = knots.gyro_bias.mean(axis=0)
+            return check_few_prisms(observations, states, bias, samples, mounting, imu.noise, Gravity.of(imu))
         fit = fit_trajectory(observations, prior=parameters.pipeline.motion, noise_scale=1.0, rest=())
         return check_imu_setup(
             fit.observations, fit.trajectory.knots, samples, mounting, imu.noise, Gravity.of(imu)
@@ -175,5 +190,5 @@ class ImuSetupMonitor:
         elif not self._confirmed and check.confirmed:
             self._confirmed = True
             self._next_ns = now_ns + INTERVAL_NS
-            message = "mounting, latency, axes and units of the IMU agree with the drive"
+            message = _CONFIRMATION_BY_PRISMS.get(len(self._parameters.prisms), _CONFIRMATION)
             self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_confirmed", message=message))

@@ -45,7 +45,12 @@ wrong measurement contradicts for no longer: those of the other prisms follow.
 """
 
 UNAIDED_S = 10.0
-"""How long there must have been no trajectory without IMU until one with an unconfirmed IMU is used."""
+"""Three stations without a trajectory for so long are not about to have one."""
+
+UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
+"""Of the position in m and the rotation in rad by what an unconfirmed set-up may have wrong: a mounting 1 deg off moves poses by
+0.35 deg rms, a lever arm 100 mm off or a latency 10 ms off by 2 mm and 0.2 deg (benchmarks/imu_trust.py).
+"""
 
 _POSE_DIM = 6
 
@@ -182,7 +187,8 @@ class ImuTakeover:
     """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
 
     ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement.
-    ``setup``: monitors the set-up of the IMU; None: nothing does. ``use``: whether poses rest on the IMU, and why not.
+    ``setup``: monitors the set-up of the IMU; None: nothing does. ``unaided_s``: for how long there must have been no trajectory
+    without IMU until one with an unconfirmed IMU is used. ``use``: whether poses rest on the IMU, and why not.
     """
 
     def __init__(
@@ -191,11 +197,13 @@ class ImuTakeover:
         without: TrajectoryWindow,
         create_with: Callable[[], InertialWindow],
         setup: ImuSetupMonitor | None = None,
+        *,
+        unaided_s: float = UNAIDED_S,
     ) -> None:
         self._imu = imu
         self._without = without
         self._create_with = create_with
-        self._setup = setup
+        self._setup, self._unaided_s = setup, unaided_s
         self._with = create_with()
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
@@ -317,7 +325,12 @@ class ImuTakeover:
             return False
         if self._without.converged or self._unaided_from_s is None:
             self._unaided_from_s = now_s
-        return now_s - self._unaided_from_s < UNAIDED_S
+        return now_s - self._unaided_from_s < self._unaided_s
+
+    @property
+    def unconfirmed(self) -> bool:
+        """Whether poses rest on the IMU, though no drive has confirmed its set-up."""
+        return self.use == ImuUse.USED and self._setup is not None and not self._setup.confirmed
 
     def _contradicted(self, now_s: float) -> bool:
         """Whether the IMU is not sound, or the trajectory with it was and is not, while the one without is."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, start_now
 from tsgt.estimation.linear import LinearEstimator
-from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,9 +32,7 @@ class LiveEstimator:
         continuous = parameters.pipeline.estimator == "continuous"
         self._with_imu = continuous and parameters.imu is not None
         self._setup = None
-        if (
-            parameters.imu is not None and len(parameters.prisms) >= MIN_PRISMS
-        ):  # fewer do not tell the mounting
+        if parameters.imu is not None:
             self._setup = ImuSetupMonitor(parameters, start_check)
         self._estimator = (
             ContinuousEstimator(parameters, self._setup) if continuous else LinearEstimator(parameters)

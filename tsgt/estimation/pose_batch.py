@@ -44,6 +44,7 @@ class Degradation(IntFlag):
     UNCERTAIN = 4
     AMBIGUOUS = 8
     RESIDUAL = 16
+    IMU_UNCONFIRMED = 32
 
 
 @functools.cache

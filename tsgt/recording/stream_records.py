@@ -33,7 +33,9 @@ CAPABILITIES = ("setup", "measurement", "point", "pose", "clock", "beacon", "sta
 Kind = Literal["interpolated", "predicted", "smoothed"]
 Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]
 Quality = Literal["good", "degraded", "invalid"]
-Degradation = Literal["prism_missing", "old_measurements", "uncertain", "ambiguous", "residual"]
+Degradation = Literal[
+    "prism_missing", "old_measurements", "uncertain", "ambiguous", "residual", "imu_unconfirmed"
+]
 ImuUse = Literal["used", "starting", "silent", "disagrees", "wrong_setup", "unconfirmed"]
 
 CONTINUOUS_PROMISE = (
@@ -200,7 +202,8 @@ class PoseRecord(FiniteNumbers):
     """What degrades a valid pose: ``prism_missing`` (fewer than three prisms are measured), ``old_measurements`` (a
     prediction whose newest measurement is older than three quarters of the outage limit), ``uncertain`` (a sigma is
     above half its limit), ``ambiguous`` (measurements contradicted each other up to 1.5 s before), ``residual``
-    (``residual_m`` is above half its limit)."""
+    (``residual_m`` is above half its limit), ``imu_unconfirmed`` (it rests on an IMU whose set-up no drive has confirmed yet;
+    the covariance allows for that)."""
     residual_m: float | None
     """Root mean square over the prisms of their distance in m from the fitted layout; null without a fit."""
     stations: tuple[StationShare, ...]

@@ -17,7 +17,7 @@ from harness.imu_calibration import (
 )
 from harness.records import SECOND, START
 
-from tsgt.estimation import ImuSetupMonitor
+from tsgt.estimation import ImuSetupMonitor, check_recorded_setup
 from tsgt.geometry import exp_so3, quaternion_from_rotation, rotation_from_quaternion
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.model import ImuSamples, PointMeasurement
@@ -150,9 +150,9 @@ def configured(change: Callable[[ImuParameters], ImuParameters]) -> Setup:
     return replace(drive(), parameters=replace(drive().parameters, imu=change(imu)))
 
 
-def turned(imu: ImuParameters) -> ImuParameters:
-    """Turn the mounting by a degree about the vertical."""
-    rotation = exp_so3(np.radians([0.0, 0.0, 1.0])) @ rotation_from_quaternion(np.array(imu.orientation_xyzw))
+def turned(imu: ImuParameters, axis: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> ImuParameters:
+    """Turn the mounting by a degree, by default about the vertical."""
+    rotation = exp_so3(np.radians(axis)) @ rotation_from_quaternion(np.array(imu.orientation_xyzw))
     x, y, z, w = quaternion_from_rotation(rotation).tolist()
     return replace(imu, orientation_xyzw=(x, y, z, w))
 
@@ -190,3 +190,44 @@ def test_wrong_setup_is_noticed_within_a_minute(setup: Callable[[], Setup], mess
 def test_right_setup_of_a_drive_is_confirmed() -> None:
     """No false alarm."""
     assert [each.event for each in drive().events()] == ["imu_setup_confirmed"]
+
+
+def checked(setup: Setup, prisms: int) -> SetupCheck:
+    """Check a set-up by the measurements of some prisms."""
+    parameters = replace(setup.parameters, prisms=setup.parameters.prisms[:prisms])
+    stations = range(1, prisms + 1)
+    return check_recorded_setup(
+        parameters, [each for each in setup.measurements if each.station in stations], setup.samples
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prisms", [2, 1])
+def test_few_prisms_confirm_a_right_setup(prisms: int) -> None:
+    """As far as they tell it."""
+    check = checked(drive(), prisms)
+    assert not check.findings
+    assert check.confirmed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prisms", [2, 1])
+def test_few_prisms_tell_the_latency(prisms: int) -> None:
+    """A clock that is 10 ms off is named."""
+    setup = configured(lambda imu: replace(imu, latency_ns=imu.latency_ns + 10_000_000))
+    (finding,) = checked(setup, prisms).findings
+    assert finding.cause == "latency"
+
+
+@pytest.mark.slow
+def test_two_prisms_tell_a_rotation_but_about_their_line() -> None:
+    """A degree about another axis is named, one about the line is not."""
+    first, second = (np.array(each.position_m) for each in drive().parameters.prisms[:2])
+    line = (second - first) / np.linalg.norm(second - first)
+    across = np.cross(line, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(line, [0.0, 0.0, 1.0]))
+    (finding,) = checked(configured(lambda imu: turned(imu, tuple(across))), 2).findings
+    assert finding.cause == "rotation"
+    assert finding.size == pytest.approx(np.radians(1.0), rel=0.2)
+    assert "rotation" not in {
+        each.cause for each in checked(configured(lambda imu: turned(imu, tuple(line))), 2).findings
+    }

@@ -303,6 +303,22 @@ def test_quarantine_doubles_with_each_disagreement_in_a_row(
     assert found == pytest.approx([4.0, 8.0, 16.0, 4.0], abs=0.11)
 
 
+def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In its covariance, and it is degraded."""
+    confirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
+    monkeypatch.setattr(ImuTakeover, "unconfirmed", True)
+    unconfirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
+    assert "imu_unconfirmed" not in confirmed.degraded_by
+    assert unconfirmed.degraded_by == ("imu_unconfirmed",)
+    assert confirmed.covariance is not None
+    assert unconfirmed.covariance is not None
+    added = np.diag((np.array(unconfirmed.covariance) - np.array(confirmed.covariance)).reshape(6, 6))
+    assert np.sqrt(added[3:]) == pytest.approx(np.radians(0.5), rel=1e-3)
+    assert (np.sqrt(added[:3]) >= 0.0049).all()
+
+
 def test_first_pose_after_a_measurement_states_its_jump(scene: Scene) -> None:
     """And no other."""
     found = records(scene, arrivals(scene, 4.0))

@@ -12,7 +12,13 @@ from tsgt.geometry.inertial_calibration.observability import (
     setup_components,
 )
 from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_calibrated_axes
-from tsgt.geometry.inertial_calibration.setup_check import Cause, SetupCheck, SetupFinding, check_imu_setup
+from tsgt.geometry.inertial_calibration.setup_check import (
+    Cause,
+    SetupCheck,
+    SetupFinding,
+    check_few_prisms,
+    check_imu_setup,
+)
 
 __all__ = [
     "Alignment",
@@ -25,6 +31,7 @@ __all__ = [
     "SetupPrior",
     "align",
     "calibrate_imu",
+    "check_few_prisms",
     "check_imu_setup",
     "in_calibrated_axes",
     "robot_covariance",

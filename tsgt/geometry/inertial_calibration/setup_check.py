@@ -2,7 +2,8 @@
 
 Gross errors, which no estimate survives, show in the rates and forces themselves. For the others the set-up is estimated as in a
 calibration, and compared with the configured one: a cause is named if it is significant and large enough to harm, and ruled out if
-the estimate is certain enough and near.
+the estimate is certain enough and near. One or two prisms do not tell a rotation of the robot about them: what they do not tell is
+taken as configured.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -41,7 +42,7 @@ from tsgt.geometry.rigid import log_so3
 
 if TYPE_CHECKING:
     from tsgt.geometry.inertial import Gravity, InertialSamples
-    from tsgt.geometry.inertial_calibration.alignment import Alignment, Products, Series
+    from tsgt.geometry.inertial_calibration.alignment import Products, Series
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory import Observations, States
     from tsgt.model import ImuNoise
@@ -67,6 +68,7 @@ MIN_OVERLAP_SHARE = 0.6
 """Of the shorter series, which the other one must overlap at any latency that is tried."""
 
 MIN_MEASUREMENTS = 60
+MIN_EXTENT_M = 0.05  # Between prisms that tell a rotation
 MATRIX_SIGMA = 1e-2  # Of the matrices beside what is configured
 MIN_RATE_FACTOR, MIN_FORCE_FACTOR = 2.0, 1.25
 MAX_AXES_ERROR_RAD = math.radians(15.0)
@@ -137,8 +139,37 @@ def check_imu_setup(
     gross = _wrong_axes(products, alignment.rotation, mounting.rotation)
     if gross is not None:
         return SetupCheck((gross,))
-    found = _estimated_errors(observations, states, samples, mounting, noise, gravity, alignment)
+    start = _Start(alignment.rotation, alignment.latency_s, alignment.gyro_bias)
+    found = _estimated_errors(observations, states, samples, mounting, noise, gravity, start)
     return replace(found, excluded=found.excluded | GROSS)
+
+
+def check_few_prisms(
+    observations: Observations,
+    states: States,
+    gyro_bias: FloatArray,
+    samples: InertialSamples,
+    mounting: Mounting,
+    noise: ImuNoise,
+    gravity: Gravity,
+) -> SetupCheck:
+    """Compare a configured IMU with measurements of one or two prisms, as :func:`check_imu_setup`.
+
+    ``states``: with the IMU, whose axes and units are right therefore; ``gyro_bias``: (3,) of these.
+    """
+    if not turns(series_of_states(states, gravity)):
+        return SetupCheck()
+    start = _Start(mounting.rotation, 0.0, gyro_bias)
+    found = _estimated_errors(observations, states, samples, mounting, noise, gravity, start)
+    return replace(found, excluded=found.excluded | GROSS)
+
+
+class _Start(NamedTuple):
+    """Where the joint estimation starts."""
+
+    rotation: FloatArray
+    latency_s: float
+    gyro_bias: FloatArray
 
 
 def _wrong_units(robot: Series, imu: Series, gravity: Gravity) -> list[SetupFinding]:
@@ -197,16 +228,16 @@ def _estimated_errors(
     mounting: Mounting,
     noise: ImuNoise,
     gravity: Gravity,
-    alignment: Alignment,
+    start: _Start,
 ) -> SetupCheck:
     """Find errors of mounting and latency by joint estimation."""
     filled = contiguous(samples, noise)
     count = int(observations.station.max()) + 1
     configured = ImuSetup.initial(mounting, 0.0, count)
-    start = replace(
-        configured, mounting=Mounting(alignment.rotation, mounting.position), latency_s=alignment.latency_s
+    near = replace(
+        configured, mounting=Mounting(start.rotation, mounting.position), latency_s=start.latency_s
     )
-    stamps_s = stamp_times(observations, start)
+    stamps_s = stamp_times(observations, near)
     measured = observations.select((stamps_s > filled.bounds_s[0]) & (stamps_s < filled.bounds_s[-1]))
     if len(measured) < MIN_MEASUREMENTS:
         return SetupCheck()
@@ -215,15 +246,21 @@ def _estimated_errors(
             measured,
             filled,
             noise,
-            lambda times_s, setup: states_of_imu(states, times_s, setup, alignment.gyro_bias),
+            lambda times_s, setup: states_of_imu(states, times_s, setup, start.gyro_bias),
             SetupPrior.wide(configured, MATRIX_SIGMA),
             gravity,
-            start=start,
+            start=near,
         )
     except GeometryError:
         return SetupCheck()
     error = solution.point.setup.local_coordinates_about(configured)
     covariance = solution.factor.shared_covariance[TILT_DIM:, TILT_DIM:]
+    axes = _unseen_rotations(observations.layout) @ mounting.rotation
+    if len(axes):
+        unseen = np.zeros((len(axes), len(error)))
+        unseen[:, ROTATION] = axes
+        gain = covariance @ unseen.T @ np.linalg.inv(unseen @ covariance @ unseen.T)
+        error, covariance = error - gain @ unseen @ error, covariance - gain @ unseen @ covariance
     # The axes that are configured are the gyro's: the accelerometer's may be turned against them in the case.
     identity = np.eye(len(error))
     parts: tuple[tuple[Cause, FloatArray, float], ...] = (
@@ -253,6 +290,14 @@ def _estimated_errors(
     confirmed = not findings and excluded >= {"rotation", "latency"}
     confirmed &= is_excluded(identity[POSITION][:2], MIN_POSITION_M)
     return SetupCheck(tuple(findings), frozenset(excluded), confirmed)
+
+
+def _unseen_rotations(layout: FloatArray) -> FloatArray:
+    """(K, 3) axes about which prisms, (M, 3) as they were measured, do not tell a rotation."""
+    prisms = np.unique(layout, axis=0)
+    _, sizes, axes = np.linalg.svd(prisms - prisms[0])
+    seen = int(np.count_nonzero(sizes > MIN_EXTENT_M))
+    return np.asarray(axes[: (3, 1, 0, 0)[seen]])
 
 
 def _describe(cause: Cause, error: FloatArray, sigma: float, mounting: Mounting) -> str:

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.imu_takeover import UNAIDED_S, UNCONFIRMED_SIGMAS, ImuTakeover
+from tsgt.estimation.imu_takeover import UNCONFIRMED_SIGMAS, ImuTakeover
 from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
-from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch
+from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.setup_uncertainty import setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
@@ -28,7 +28,6 @@ from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
 from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
-from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -71,7 +70,7 @@ class ContinuousEstimator:
                 self._without_imu,
                 self._create_with_imu,
                 imu_setup,
-                unaided_s=UNAIDED_S if len(layout) >= MIN_PRISMS else 0.0,
+                prisms=len(layout),
             )
         )
         self._pending: list[Measurement] = []
@@ -245,6 +244,9 @@ class ContinuousEstimator:
         """Fill in whether poses rest on the IMU."""
         if self._imu is not None:
             batch.imu[:] = self._imu.use
+            if self._imu.station_contradicted:
+                batch.reason[batch.valid] = Reason.CONTRADICTED
+                batch.degraded[:] = 0
             if self._imu.unconfirmed:
                 batch.degraded[batch.valid] |= Degradation.IMU_UNCONFIRMED
         return batch

@@ -15,6 +15,7 @@ import numpy as np
 
 from tsgt.estimation.inertial import SampleConverter
 from tsgt.estimation.pose_batch import ImuUse
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -180,6 +181,8 @@ class ImuState(NamedTuple):
     accelerometer_bias_mps2: Vector3 | None
 
 
+_BY_PRISMS = "disagrees with the prisms"  # What the health of a trajectory says of innovations
+
 _WRONG = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
 
 
@@ -187,8 +190,9 @@ class ImuTakeover:
     """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
 
     ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement.
-    ``setup``: monitors the set-up of the IMU; None: nothing does. ``unaided_s``: for how long there must have been no trajectory
-    without IMU until one with an unconfirmed IMU is used. ``use``: whether poses rest on the IMU, and why not.
+    ``setup``: monitors the set-up of the IMU; None: nothing does. ``prisms``: of the layout. ``use``: whether poses rest on the
+    IMU, and why not. ``station_contradicted``: whether the IMU has contradicted the only station, and the trajectory follows it
+    nevertheless, because nothing tells which of the two is wrong.
     """
 
     def __init__(
@@ -198,12 +202,14 @@ class ImuTakeover:
         create_with: Callable[[], InertialWindow],
         setup: ImuSetupMonitor | None = None,
         *,
-        unaided_s: float = UNAIDED_S,
+        prisms: int = MIN_PRISMS,
     ) -> None:
         self._imu = imu
         self._without = without
         self._create_with = create_with
-        self._setup, self._unaided_s = setup, unaided_s
+        self._setup, self._prisms = setup, prisms
+        self._established = self.station_contradicted = False
+        self._ambiguous_from_s = np.inf  # of the trajectory with the IMU
         self._with = create_with()
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
@@ -275,6 +281,8 @@ class ImuTakeover:
             self._next_comparison_s = now_s + COMPARISON_INTERVAL_S
             self._compare(now_s)
         found = self._found(now_s)
+        if self._prisms == 1:
+            self._watch_station(found)
         if found in _WRONG:
             self._disagreement = self._untrusted or self._contradiction
             # What the samples show by themselves passes; whatever else it was may have come to stay.
@@ -304,6 +312,22 @@ class ImuTakeover:
         self._without.marginalise_before(before_s)
         self._with.marginalise_before(before_s)
 
+    def _watch_station(self, found: ImuUse) -> None:
+        """Note whether measurements of the only prism contradicted the IMU, and are followed from then on.
+
+        A wrong one among right ones is an outlier, which is not followed.
+        """
+        rejected = found == ImuUse.DISAGREES and _BY_PRISMS in self._contradiction
+        followed = False
+        if self._with.ambiguous:
+            self._ambiguous_from_s = min(self._ambiguous_from_s, self._with.ambiguous_from_s)
+        elif self._with.converged:
+            if np.isfinite(self._ambiguous_from_s):
+                followed = bool(self._with.ambiguous_at(np.array([self._ambiguous_from_s + 1.0]))[0])
+            self._ambiguous_from_s = np.inf
+        self.station_contradicted |= self._established and (followed or rejected)
+        self._established |= self._with.converged and not self._with.ambiguous
+
     @property
     def _untrusted(self) -> str | None:
         return None if self._setup is None else self._setup.untrusted
@@ -325,7 +349,7 @@ class ImuTakeover:
             return False
         if self._without.converged or self._unaided_from_s is None:
             self._unaided_from_s = now_s
-        return now_s - self._unaided_from_s < self._unaided_s
+        return now_s - self._unaided_from_s < (UNAIDED_S if self._prisms >= MIN_PRISMS else 0.0)
 
     @property
     def unconfirmed(self) -> bool:

@@ -29,6 +29,7 @@ class Reason(IntEnum):
     UNCERTAIN = 4
     OUTAGE = 5
     STATION_STATUS = 6
+    CONTRADICTED = 7
 
     @property
     def word(self) -> stream_records.Reason:

@@ -28,20 +28,24 @@ _CAUSES = {
 
 
 class ImuUseMonitor(Observer):
-    """Watches the predicted poses."""
+    """Watches the predicted poses, and whether the IMU has contradicted the only station."""
 
     def __init__(self) -> None:
         self._use = "starting"
+        self._contradicted = False
         self._reported = False  # that it is not used
         self._sigmas = (math.inf, math.inf)
         self._next_jump_ns = -(2**63)
 
     def pose(self, record: PoseRecord, now_ns: int) -> list[EventRecord]:
-        """Take a pose that was published at ``now_ns``; return ``imu_used``, ``imu_not_used`` and ``pose_jump``."""
+        """Take a pose that was published at ``now_ns``; return ``imu_used``, ``imu_not_used``, ``pose_jump`` and ``station_contradicted``."""
         if record.kind != "predicted" or record.imu is None:
             return []
         events = self._jump(record, now_ns)
         self._sigmas = _sigmas(record)
+        if record.reason == "contradicted" and not self._contradicted:
+            self._contradicted = True
+            events.append(_contradiction(record.stations[0].id, now_ns))
         if record.imu != self._use:
             # While it is not used its cause may change; there is one event, and one when it is used again. There is none
             # for the first seconds, but for an IMU that is not used until the robot drives.
@@ -64,6 +68,14 @@ class ImuUseMonitor(Observer):
             f"{math.degrees(record.jump_rad):.2f} deg, more than {MAX_JUMP_SIGMAS:g} sigmas"
         )
         return [EventRecord(stamp_ns=now_ns, event="pose_jump", message=message)]
+
+
+def _contradiction(station: int, now_ns: int) -> EventRecord:
+    message = (
+        f"measurements of station {station} contradicted the IMU and went on from elsewhere: its tripod or prism may have moved; "
+        "poses are invalid until the master is restarted. Check the station first: tsgt calibrate check"
+    )
+    return EventRecord(stamp_ns=now_ns, event="station_contradicted", message=message, station=station)
 
 
 def _event(use: str, now_ns: int) -> EventRecord:

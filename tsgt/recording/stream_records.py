@@ -31,7 +31,9 @@ PROTOCOL_VERSION = 1
 CAPABILITIES = ("setup", "measurement", "point", "pose", "clock", "beacon", "status", "event")
 
 Kind = Literal["interpolated", "predicted", "smoothed"]
-Reason = Literal["", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt"]
+Reason = Literal[
+    "", "outage", "station_status", "degenerate_geometry", "uncertain", "residual", "tilt", "contradicted"
+]
 Quality = Literal["good", "degraded", "invalid"]
 Degradation = Literal[
     "prism_missing", "old_measurements", "uncertain", "ambiguous", "residual", "imu_unconfirmed"
@@ -194,7 +196,8 @@ class PoseRecord(FiniteNumbers):
     """Why it is invalid: ``outage`` (a prism without measurements for too long), ``station_status`` (the instrument
     reported an error), ``degenerate_geometry`` (prisms collinear or coincident), ``residual`` (the prisms miss their
     layout by too much), ``uncertain`` (all prisms are measured, but the pose is not known well enough), ``tilt`` (the
-    robot would lean too far: mirrored layout or swapped prisms). Empty when valid."""
+    robot would lean too far: mirrored layout or swapped prisms), ``contradicted`` (with one station: the IMU has contradicted its measurements, so its
+    tripod or prism may have moved; until the master is restarted). Empty when valid."""
     quality: Quality | None = None
     """``good``; ``degraded``: valid, but with less reserve, see ``degraded_by``; ``invalid``: not ``valid``. Null in
     recordings of older versions."""

@@ -13,6 +13,7 @@ from harness.records import IMU_PARAMETERS, imu_samples
 from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
 from tsgt.estimation import LiveEstimator, imu_setup_monitor
+from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.estimation.imu_takeover import PROVEN_S, QUARANTINE_S, SILENCE_S, SOUND_S, UNAIDED_S, ImuTakeover
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
@@ -317,6 +318,59 @@ def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
     added = np.diag((np.array(unconfirmed.covariance) - np.array(confirmed.covariance)).reshape(6, 6))
     assert np.sqrt(added[3:]) == pytest.approx(np.radians(0.5), rel=1e-3)
     assert (np.sqrt(added[:3]) >= 0.0049).all()
+
+
+STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
+
+
+@pytest.mark.parametrize(
+    ("prisms", "followed", "health", "contradicted"),
+    [
+        (1, True, None, True),
+        (1, False, None, False),
+        (2, True, None, False),
+        (1, False, DISAGREES, True),
+        (1, False, STUCK, False),
+        (2, False, DISAGREES, False),
+    ],
+)
+def test_contradiction_of_the_only_station_lasts(
+    prisms: int, *, followed: bool, health: str | None, contradicted: bool
+) -> None:
+    """Where the trajectory follows what contradicted the IMU; an outlier, or an IMU that is stuck, is none."""
+    without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
+    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
+    window.setup_in_doubt = False
+    window.ambiguous_from_s = 2.5
+    window.ambiguous_at = lambda time_s: np.array([followed]) & (time_s > window.ambiguous_from_s)
+    takeover = ImuTakeover(IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), prisms=prisms)
+    takeover.begin(START)
+    found = []
+    for number in range(20):
+        window.ambiguous = 8 <= number < 12
+        window.health = health if number == 10 else None
+        takeover.add_samples(imu_samples(100 * number, count=100))
+        takeover.take_samples()
+        takeover.choose(0.5 * (number + 1))
+        found.append(takeover.station_contradicted)
+    assert not any(found[:10])
+    assert found[-1] == contradicted
+
+
+def test_poses_of_a_contradicted_station_are_invalid(scene: Scene) -> None:
+    """And say why."""
+    live = checked(scene)
+    poses = []
+    for each in arrivals(scene, 3.0):
+        estimator = live._estimator
+        assert isinstance(estimator, ContinuousEstimator)
+        assert estimator._imu is not None
+        estimator._imu.station_contradicted = each.received_ns > START + 2 * SECOND
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    reasons = {pose.reason for pose in poses if time_of(pose) > 2.1}
+    assert reasons == {"contradicted"}
+    assert any(pose.valid for pose in poses)
 
 
 def test_first_pose_after_a_measurement_states_its_jump(scene: Scene) -> None:

@@ -37,6 +37,16 @@ def test_unconfirmed_setup_is_an_event() -> None:
     assert names(monitor, "unconfirmed", "starting", "unconfirmed", "used") == ["imu_used"]
 
 
+def test_contradicted_station_is_an_event_once() -> None:
+    """With its number."""
+    monitor = ImuUseMonitor()
+    monitor.pose(PREDICTED, START)
+    contradicted = replace(PREDICTED, valid=False, reason="contradicted")
+    (event,) = monitor.pose(contradicted, START)
+    assert (event.event, event.station) == ("station_contradicted", PREDICTED.stations[0].id)
+    assert not monitor.pose(contradicted, START + SECOND)
+
+
 def test_event_names_the_cause() -> None:
     """In words."""
     monitor = ImuUseMonitor()

@@ -61,8 +61,11 @@ MIN_LATENCY_S = 0.004
 """Errors below these harm little: a few tenths of a millimetre, a few hundredths of a degree."""
 
 MIN_SIGNIFICANCE = 5.0  # Sigmas, of three components together
-EXCLUDED_LIMITS, EXCLUDED_SIGMAS = 2.0, 2.0
-"""An error is ruled out if it is below this many of the limits above, with this many sigmas added."""
+EXCLUDED_SIGMAS = 2.0
+CONFIRMED_LIMITS = 2.0
+"""An error is ruled out if it is below the limits above with so many sigmas added. A set-up is confirmed if no error is found, and
+each would be below so many of these limits.
+"""
 
 MIN_OVERLAP_SHARE = 0.6
 """Of the shorter series, which the other one must overlap at any latency that is tried."""
@@ -269,26 +272,31 @@ def _estimated_errors(
         ("latency", identity[LATENCY : LATENCY + 1], MIN_LATENCY_S),
     )
 
-    def is_excluded(jacobian: FloatArray, limit: float) -> bool:
-        """Whether an error is small for certain."""
-        part, own = jacobian @ error, jacobian @ covariance @ jacobian.T
-        sigma = np.sqrt(np.linalg.eigvalsh(own)[-1])
-        return bool(np.linalg.norm(part) + EXCLUDED_SIGMAS * sigma < EXCLUDED_LIMITS * limit)
+    def bound(jacobian: FloatArray) -> float:
+        """Return what an error is below for certain."""
+        sigma = np.sqrt(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])
+        return float(np.linalg.norm(jacobian @ error) + EXCLUDED_SIGMAS * sigma)
 
     findings: list[SetupFinding] = []
-    excluded: set[Cause] = {cause for cause, jacobian, limit in parts if is_excluded(jacobian, limit)}
-    if is_excluded(identity[ROTATION], MIN_ROTATION_RAD):
-        excluded.add("rotation")  # of the accelerometer, sooner than of the gyro about the vertical
+    excluded: set[Cause] = {cause for cause, jacobian, limit in parts if bound(jacobian) < limit}
     for cause, jacobian, limit in parts:
         part, own = jacobian @ error, jacobian @ covariance @ jacobian.T
         size = float(np.linalg.norm(part))
-        if size < limit or part @ np.linalg.solve(own, part) < MIN_SIGNIFICANCE**2:
+        if (
+            size < limit
+            or part @ np.linalg.pinv(own, rcond=1e-9, hermitian=True) @ part < MIN_SIGNIFICANCE**2
+        ):
             continue
         sigma = float(np.sqrt(part @ own @ part)) / size
         findings.append(SetupFinding(cause, size, sigma, _describe(cause, part, sigma, mounting)))
         excluded.discard(cause)
-    confirmed = not findings and excluded >= {"rotation", "latency"}
-    confirmed &= is_excluded(identity[POSITION][:2], MIN_POSITION_M)
+    bounds = (
+        # The accelerometer tells the rotation about the vertical sooner than the gyro.
+        min(bound(gyro_rotation(solution.point.setup)), bound(identity[ROTATION])) / MIN_ROTATION_RAD,
+        bound(identity[POSITION][:2]) / MIN_POSITION_M,
+        bound(identity[LATENCY : LATENCY + 1]) / MIN_LATENCY_S,
+    )
+    confirmed = not findings and max(bounds) < CONFIRMED_LIMITS
     return SetupCheck(tuple(findings), frozenset(excluded), confirmed)
 
 

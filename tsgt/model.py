@@ -624,6 +624,49 @@ class OdometryParameters(FiniteNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OdometrySamples:
+    """Consecutive samples of the robot's wheel odometry, raw: each is the mean over an interval of time.
+
+    The lists have one entry per sample; they hold one line of the program that reads the odometry.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["odometry"] = "odometry"
+    sequence: int
+    """Number of the first sample; lost samples are counted."""
+    received_ns: int
+    """Arrival of the line on the master's Unix clock in ns."""
+    stamp_ns: tuple[int, ...]
+    """End of each sample's interval on the master's Unix clock in ns, by the fitted clock of the device."""
+    duration_ns: tuple[int, ...]
+    """Length of each interval in ns, by the clock or the counter of the device."""
+    instrument_time_ns: tuple[int, ...] | None
+    """End of each interval on the clock of the device in ns; null where it has none."""
+    speed_mps: tuple[float, ...]
+    """Mean speed along the direction of travel in m/s, positive forwards."""
+    yaw_rate_radps: tuple[float, ...] | None
+    """Mean yaw rate in rad/s, positive to the left; null where the device gives none. It is recorded, and not used: the gyro
+    is better by far."""
+    valid: tuple[bool, ...]
+    """Whether the device trusts the sample."""
+
+    def __post_init__(self) -> None:
+        """Reject lists of different length and impossible times."""
+        n = len(self.stamp_ns)
+        lists = (
+            self.duration_ns,
+            self.speed_mps,
+            self.valid,
+            self.instrument_time_ns or self.stamp_ns,
+            self.stamp_ns if self.yaw_rate_radps is None else self.yaw_rate_radps,
+        )
+        if n == 0 or any(len(each) != n for each in lists):
+            raise ValueError("the lists of a line have different lengths, or none has an entry")
+        check_instants(self.received_ns, *self.stamp_ns, *self.duration_ns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SetupCovariance(FiniteNumbers):
     """Joint covariance of the calibrated set-up, which all poses share: it does not average out over time."""
 
@@ -656,7 +699,7 @@ class SetupCovariance(FiniteNumbers):
 class Parameters:
     """Every parameter in force: what post-processing a recording needs."""
 
-    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu"})
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu", "odometry"})
 
     type: Literal["parameters"] = "parameters"
     stations: tuple[StationParameters, ...]
@@ -671,3 +714,5 @@ class Parameters:
     """Uncertainty of station frames, latencies, instrument errors and prisms; null where unknown: taken as exact."""
     imu: ImuParameters | None = None
     """The robot's IMU; absent where none is configured."""
+    odometry: OdometryParameters | None = None
+    """The robot's wheel odometry, which is used with the IMU; absent where none is configured."""

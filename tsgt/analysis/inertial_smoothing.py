@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.estimation import centroid_m, inertial_samples, setup_jacobian
+from tsgt.estimation import centroid_m, inertial_samples, setup_jacobian, wheel_samples
 from tsgt.geometry.batch import overall_scale, scale_noise
 from tsgt.geometry.inertial import fit_inertial_trajectory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
     from typing import Any
 
     from numpy.typing import NDArray
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import InertialFit, InertialSamples
     from tsgt.geometry.trajectory import Observations, SetupJacobian
-    from tsgt.model import ImuNoise, ImuSamples, Parameters
+    from tsgt.model import ImuNoise, ImuSamples, OdometrySamples, Parameters
 
 MAX_GAP_S = 0.5
 """Samples that are missing for longer are worse than the motion prior, which a pose without the IMU has instead."""
@@ -59,6 +59,7 @@ class ImuUse:
     noise_scales: FloatArray  # (S + 1, 3) factors on the stated noise of the measurements
     noise_scale: float  # Their root mean square over all measurements and components
     unused: tuple[UnusedInterval, ...]
+    odometry_samples: int = 0  # Of the wheel odometry that was used with it
 
     def unused_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """(N,) whether the IMU is not to be used at times."""
@@ -78,6 +79,7 @@ def fit_with_imu(
     observations: Observations,
     records: Iterable[ImuSamples],
     *,
+    odometry: Sequence[OdometrySamples] = (),
     origin_ns: int,
     noise_scales: FloatArray,
     tuned: bool,
@@ -95,12 +97,17 @@ def fit_with_imu(
     if not len(samples) or samples.end_s[-1] < start_s or samples.end_s[0] > end_s:
         raise GeometryError("the samples of the IMU are from another time than the measurements")
 
+    wheels = None
+    if parameters.odometry is not None and odometry:
+        wheels = wheel_samples(odometry, parameters.odometry, origin_ns), parameters.odometry
+
     def fitted(scales: FloatArray, by_setup: SetupJacobian | None = None) -> InertialFit:
         return fit_inertial_trajectory(
             scale_noise(observations, scales),
             samples,
             imu,
             reference_m=centroid_m(parameters),
+            odometry=wheels,
             setup_jacobian=by_setup,
             on_progress=on_progress,
         )
@@ -124,6 +131,7 @@ def fit_with_imu(
         noise_scales,
         overall_scale(observations, noise_scales),
         (*gaps(samples, start_s, end_s), *contradicted),
+        0 if wheels is None else len(wheels[0]),
     )
 
 
@@ -193,6 +201,7 @@ def imu_keys(used: ImuUse | None, problem: str) -> dict[str, Any]:
             "stations": list(used.stations),
             "samples": len(used.samples),
             "unused_s": used.unused_s,
+            **({"odometry_samples": used.odometry_samples} if used.odometry_samples else {}),
             "tilt_sigma_mrad": 1e3 * used.fit.tilt_sigma_rad,
         }
     }

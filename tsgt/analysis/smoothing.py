@@ -149,6 +149,7 @@ def smooth_recording(
                 parameters,
                 observations,
                 recording.imu_samples,
+                odometry=recording.odometry,
                 origin_ns=origin_ns,
                 noise_scales=motion.noise_scales,
                 tuned=motion.tuned,

@@ -212,6 +212,8 @@ def imu_text(found: SmoothedRecording) -> str | None:
     used = found.imu
     numbers = ", ".join(map(str, used.stations))
     text = f"IMU: used with {'station' if len(used.stations) == 1 else 'stations'} {numbers}, {len(used.samples)} samples"
+    if used.odometry_samples:
+        text += f", wheel odometry of {used.odometry_samples} samples"
     for reason, words in (
         ("gap", "without samples"),
         ("contradiction", "in contradiction to the measurements"),

@@ -44,6 +44,7 @@ from tsgt.config.master import (
     StationConfig,
     StreamConfig,
 )
+from tsgt.config.odometry import OdometryConfig
 from tsgt.config.parameters import level_frame, noise, parameters, scenario_parameters
 from tsgt.config.permissions import check_permissions
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
@@ -102,6 +103,7 @@ __all__ = [
     "MotionConfig",
     "NoiseConfig",
     "OcclusionConfig",
+    "OdometryConfig",
     "PipelineConfig",
     "PressureHpa",
     "PrismLayout",

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from tsgt.config.alarms import AlarmsConfig
 from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, unique_by
 from tsgt.config.imu import ImuConfig
+from tsgt.config.odometry import OdometryConfig
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import MasterProtocolConfig, RadioConfig, check_numbers
 from tsgt.polygon import check_simple
@@ -124,6 +125,8 @@ class MasterConfig(Model):
     """Reference point of the poses: the robot frame by default."""
     imu: ImuConfig | None = None
     """The robot's IMU, if it has one."""
+    odometry: OdometryConfig | None = None
+    """The robot's wheel odometry, if it has one: beside an IMU."""
     frame_watch: FrameWatchConfig = FrameWatchConfig()
     """Layout monitor."""
     geofences: Annotated[tuple[GeofenceConfig, ...], unique_by("name")] = ()
@@ -134,6 +137,12 @@ class MasterConfig(Model):
     """Pose stream."""
     recording: RecordingConfig = RecordingConfig()
     """Recording on disk."""
+
+    @model_validator(mode="after")
+    def _odometry_has_an_imu(self) -> MasterConfig:
+        if self.odometry is not None and self.imu is None:
+            raise ValueError("odometry needs the table [imu]: without an IMU wheels do not tell a pose")
+        return self
 
     @model_validator(mode="after")
     def _numbers_fit_the_protocol(self) -> MasterConfig:

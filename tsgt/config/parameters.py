@@ -92,6 +92,7 @@ def parameters(config: MasterConfig) -> Parameters:
             imu=None if mounting is None else mounting.covariance,
         ),
         imu=imu,
+        odometry=None if config.odometry is None else config.odometry.parameters(),
     )
 
 

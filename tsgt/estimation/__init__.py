@@ -12,6 +12,7 @@ from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m, instrument_time_sigma_s
+from tsgt.estimation.odometry import wheel_samples
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.pose_quality import sigma_limits_of
@@ -87,6 +88,7 @@ __all__ = [
     "transform_of",
     "uncertain_setup",
     "usable",
+    "wheel_samples",
     "with_noise_scales",
     "with_setup",
 ]

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from tsgt.estimation.imu_takeover import ImuState, TrajectoryWindow
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import States
-    from tsgt.model import ImuSamples, Measurement, Parameters
+    from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
 
 SMOOTHING_INTERVAL_NS = 500_000_000
 
@@ -71,6 +71,7 @@ class ContinuousEstimator:
                 self._create_with_imu,
                 imu_setup,
                 prisms=len(layout),
+                odometry=parameters.odometry,
             )
         )
         self._pending: list[Measurement] = []
@@ -103,6 +104,7 @@ class ContinuousEstimator:
             self._limits.motion,
             reference_m=centroid_m(self._parameters),
             setup_jacobian=setup_jacobian(self._parameters),
+            odometry=self._parameters.odometry,
         )
 
     def begin_at(self, now_ns: int) -> None:
@@ -130,6 +132,11 @@ class ContinuousEstimator:
         """Add samples of the IMU; ignored where none is configured."""
         if self._imu is not None:
             self._imu.add_samples(samples)
+
+    def add_odometry(self, samples: OdometrySamples) -> None:
+        """Add samples of the wheel odometry; ignored where no IMU or no odometry is configured."""
+        if self._imu is not None:
+            self._imu.add_odometry(samples)
 
     def advance(self, now_ns: int) -> PoseBatch:
         """Return the predicted poses of new epochs up to now, and the poses that are smoothed with them."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from tsgt.estimation.inertial import SampleConverter
+from tsgt.estimation.odometry import WheelConverter
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.model import MIN_PRISMS
 
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
 
     from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.inertial import InertialSamples
+    from tsgt.geometry.inertial import InertialSamples, WheelSamples
     from tsgt.geometry.trajectory import Observations, States
-    from tsgt.model import ImuParameters, ImuSamples, Vector3
+    from tsgt.model import ImuParameters, ImuSamples, OdometryParameters, OdometrySamples, Vector3
 
 SILENCE_S = 0.3
 """Without a sample for this long the IMU is silent. Lines of ten samples, held up by a computer under load, come sooner."""
@@ -171,6 +172,10 @@ class InertialWindow(TrajectoryWindow, Protocol):
         """Take samples that follow the earlier ones."""
         ...
 
+    def add_odometry(self, new: WheelSamples) -> None:
+        """Take samples of the wheel odometry that follow the earlier ones."""
+        ...
+
 
 class ImuState(NamedTuple):
     """What the estimator knows of the IMU: whether poses rest on it, why it disagrees, and its biases as in the status."""
@@ -203,6 +208,7 @@ class ImuTakeover:
         setup: ImuSetupMonitor | None = None,
         *,
         prisms: int = MIN_PRISMS,
+        odometry: OdometryParameters | None = None,
     ) -> None:
         self._imu = imu
         self._without = without
@@ -214,6 +220,9 @@ class ImuTakeover:
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
         self._records: deque[ImuSamples] = deque()
+        self._odometry = odometry
+        self._wheels: WheelConverter | None = None
+        self._driven: deque[OdometrySamples] = deque()
         self._newest_s = self._sound_from_s = self._next_comparison_s = -np.inf
         self._contradicted_from_s = np.inf
         self._unaided_from_s: float | None = None
@@ -251,6 +260,8 @@ class ImuTakeover:
     def begin(self, origin_ns: int) -> None:
         """Fix the time origin of the observations."""
         self._converter = SampleConverter(self._imu, origin_ns)
+        if self._odometry is not None:
+            self._wheels = WheelConverter(self._odometry, origin_ns)
 
     def add_samples(self, record: ImuSamples) -> None:
         """Take samples; before the first measurement only the newest are kept."""
@@ -258,8 +269,17 @@ class ImuTakeover:
         while self._records[0].received_ns < record.received_ns - _KEPT_BEFORE_START_NS:
             self._records.popleft()
 
+    def add_odometry(self, record: OdometrySamples) -> None:
+        """Take samples of the wheel odometry; before the first measurement only the newest are kept."""
+        self._driven.append(record)
+        while self._driven[0].received_ns < record.received_ns - _KEPT_BEFORE_START_NS:
+            self._driven.popleft()
+
     def take_samples(self) -> None:
         """Use the samples that were added."""
+        if self._wheels is not None and self._driven:
+            self._with.add_odometry(self._wheels.convert(self._driven))
+            self._driven.clear()
         if self._converter is None or not self._records:
             return
         samples = self._converter.convert(self._records)

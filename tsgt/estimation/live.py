@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from tsgt.estimation.imu_setup_monitor import StartCheck
     from tsgt.estimation.imu_takeover import ImuState
-    from tsgt.model import ImuSamples, Measurement, Parameters
+    from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
     from tsgt.recording import EventRecord, PoseRecord
 
 
@@ -68,6 +68,17 @@ class LiveEstimator:
         if isinstance(self._estimator, ContinuousEstimator):
             self._estimator.add_samples(samples)
         self._check_setup(samples)
+        return [*due, samples]
+
+    def odometry_samples(self, samples: OdometrySamples) -> list[OdometrySamples | PoseRecord]:
+        """Take samples of the wheel odometry, as :meth:`imu_samples`."""
+        if not self._with_imu:
+            return [samples]
+        if samples.received_ns < self._now_ns:
+            samples = dataclasses.replace(samples, received_ns=self._now_ns)
+        due = self.advance(samples.received_ns)
+        if isinstance(self._estimator, ContinuousEstimator):
+            self._estimator.add_odometry(samples)
         return [*due, samples]
 
     def _check_setup(self, samples: ImuSamples) -> None:

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import LiveEstimator
-from tsgt.model import ImuSamples, Measurement, Parameters, PointMeasurement, PolarMeasurement
+from tsgt.model import (
+    ImuSamples,
+    Measurement,
+    OdometrySamples,
+    Parameters,
+    PointMeasurement,
+    PolarMeasurement,
+)
 from tsgt.recording import (
     BeaconRecord,
     ClockRecord,
@@ -29,13 +36,23 @@ if TYPE_CHECKING:
     from tsgt.master.stream_server import StreamServer
     from tsgt.recording import Line
 
-_Arrival = Measurement | ImuSamples | SetupRecord | StatusRecord | EventRecord | ClockRecord | BeaconRecord
+_Arrival = (
+    Measurement
+    | ImuSamples
+    | OdometrySamples
+    | SetupRecord
+    | StatusRecord
+    | EventRecord
+    | ClockRecord
+    | BeaconRecord
+)
 
-# Records that arrived at the master; headers and parameters are not on the stream, nor are the samples of an IMU.
+# Records that arrived at the master; headers and parameters are not on the stream, nor are samples of an IMU and of wheels.
 _ARRIVALS: dict[str, type[_Arrival]] = {
     "measurement": PolarMeasurement,
     "point": PointMeasurement,
     "imu": ImuSamples,
+    "odometry": OdometrySamples,
     "setup": SetupRecord,
     "clock": ClockRecord,
     "beacon": BeaconRecord,
@@ -115,6 +132,10 @@ def _arrival(
     elif isinstance(record, ImuSamples):
         now_ns = record.received_ns
         poses = [encode_line(each) for each in estimator.imu_samples(record)[:-1]]
+        return now_ns, poses, len(poses)
+    elif isinstance(record, OdometrySamples):
+        now_ns = record.received_ns
+        poses = [encode_line(each) for each in estimator.odometry_samples(record)[:-1]]
         return now_ns, poses, len(poses)
     else:
         now_ns = record.received_ns

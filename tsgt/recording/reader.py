@@ -7,7 +7,14 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from tsgt.errors import CorruptLineError, RecordingError
-from tsgt.model import ImuSamples, Measurement, Parameters, PointMeasurement, PolarMeasurement
+from tsgt.model import (
+    ImuSamples,
+    Measurement,
+    OdometrySamples,
+    Parameters,
+    PointMeasurement,
+    PolarMeasurement,
+)
 from tsgt.recording.format import (
     MAX_LINE_BYTES,
     NO_HEADER,
@@ -42,6 +49,7 @@ class Recording:
     imu_samples: list[ImuSamples] = field(
         default_factory=list
     )  # in the order of arrival; empty unless they were read
+    odometry: list[OdometrySamples] = field(default_factory=list)  # likewise
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +114,14 @@ def load_recording(
 ) -> Recording:
     """Read measurements and parameters for post-processing.
 
-    ``imu``: also read the samples of the robot's IMU. ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
+    ``imu``: also read the samples of the robot's IMU and wheel odometry. ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
     cannot be read. Raises RecordingError as :func:`read_lines`, and without parameters in the file.
     """
     header: RecordingHeader | None = None
     parameters: Parameters | None = None
     measurements: list[Measurement] = []
     imu_samples: list[ImuSamples] = []
+    odometry: list[OdometrySamples] = []
     end_ns: int | None = None
     for line in read_lines(path, imu=imu, keep_going=keep_going, on_problem=on_problem):
         known_ns: int | None = None
@@ -131,6 +140,8 @@ def load_recording(
                     known_ns = measurements[-1].received_ns
                 case "imu":
                     imu_samples.append(decode_line(ImuSamples, line, path))
+                case "odometry" if imu:
+                    odometry.append(decode_line(OdometrySamples, line, path))
                 case "status" | "event":
                     known_ns = decode_line(_Stamped, line, path).stamp_ns
         except CorruptLineError as problem:
@@ -148,6 +159,7 @@ def load_recording(
         measurements=measurements,
         end_ns=end_ns,
         imu_samples=imu_samples,
+        odometry=odometry,
     )
 
 

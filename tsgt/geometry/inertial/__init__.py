@@ -8,7 +8,7 @@ from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
 from tsgt.geometry.inertial.fixed_lag import InertialFixedLagSmoother, WindowTrajectory
 from tsgt.geometry.inertial.health import sound_samples
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
-from tsgt.geometry.inertial.odometry import Odometry, OdometrySamples
+from tsgt.geometry.inertial.odometry import Odometry, WheelSamples
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
@@ -51,8 +51,8 @@ __all__ = [
     "InertialTrajectory",
     "Mounting",
     "Odometry",
-    "OdometrySamples",
     "Preintegrated",
+    "WheelSamples",
     "WindowTrajectory",
     "anchor_at_end",
     "concatenate_inertial_states",

@@ -23,7 +23,7 @@ from tsgt.geometry.inertial.factors import (
 )
 from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
-from tsgt.geometry.inertial.odometry import Odometry, OdometrySamples
+from tsgt.geometry.inertial.odometry import Odometry, WheelSamples
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
@@ -117,7 +117,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._odometry = (
             None
             if odometry is None
-            else Odometry.of(OdometrySamples.none(), odometry, self._mounting, reference_m)
+            else Odometry.of(WheelSamples.none(), odometry, self._mounting, reference_m)
         )
         self._prior, self._gyro_only = prior, prior if gyro_only else None
         self._initial_gravity = self._gravity = Gravity.of(imu)
@@ -194,7 +194,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if self._predictor is not None:
             self._predictor.discard_after(from_s)
 
-    def add_odometry(self, new: OdometrySamples) -> None:
+    def add_odometry(self, new: WheelSamples) -> None:
         """Add samples of the wheel odometry, in the order of time; they may precede others that were added before."""
         if self._odometry is None or not len(new):
             return

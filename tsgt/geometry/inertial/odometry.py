@@ -31,7 +31,7 @@ _TOUCHING = 0.5  # Samples that are closer than this share of their duration fol
 
 
 @dataclass(frozen=True, slots=True)
-class OdometrySamples:
+class WheelSamples:
     """N samples in the order of time; each is the mean over the interval that ends at ``end_s``."""
 
     end_s: FloatArray  # (N,) from the time origin of the observations
@@ -39,20 +39,20 @@ class OdometrySamples:
     speed_mps: FloatArray  # (N,) along the direction of travel, positive forwards
 
     @classmethod
-    def none(cls) -> OdometrySamples:
+    def none(cls) -> WheelSamples:
         """Return no samples."""
         return cls(np.empty(0), np.empty(0), np.empty(0))
 
     def __len__(self) -> int:
         return len(self.end_s)
 
-    def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> OdometrySamples:
+    def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> WheelSamples:
         """Return the samples of some rows."""
-        return OdometrySamples(*(getattr(self, each.name)[rows] for each in fields(self)))
+        return WheelSamples(*(getattr(self, each.name)[rows] for each in fields(self)))
 
-    def joined(self, others: OdometrySamples) -> OdometrySamples:
+    def joined(self, others: WheelSamples) -> WheelSamples:
         """Return these samples and others, in the order of time; of two of the same interval the first."""
-        both = OdometrySamples(
+        both = WheelSamples(
             *(np.concatenate([getattr(self, each.name), getattr(others, each.name)]) for each in fields(self))
         )
         order = np.argsort(both.end_s, kind="stable")
@@ -100,7 +100,7 @@ class OdometrySteps:
 class Odometry:
     """Wheel odometry and how it is used."""
 
-    samples: OdometrySamples
+    samples: WheelSamples
     parameters: OdometryParameters
     arm_m: FloatArray  # (3,) the wheels' point, from the origin of the states in the axes of the IMU
     axes: FloatArray  # (3, 3) ``R_imu_wheels``: columns forwards, to the left, up
@@ -108,7 +108,7 @@ class Odometry:
     @classmethod
     def of(
         cls,
-        samples: OdometrySamples,
+        samples: WheelSamples,
         parameters: OdometryParameters,
         mounting: Mounting,
         reference_m: FloatArray,

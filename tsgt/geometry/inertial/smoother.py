@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.geometry.inertial.initialisation import HeadingSearch
-    from tsgt.geometry.inertial.odometry import OdometrySamples
+    from tsgt.geometry.inertial.odometry import WheelSamples
     from tsgt.geometry.inertial.preintegration import Preintegrated
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.inertial.solver import InertialSolution
@@ -95,7 +95,7 @@ def fit_inertial_trajectory(
     *,
     reference_m: FloatArray,
     gyro_only: MotionPrior | None = None,
-    odometry: tuple[OdometrySamples, OdometryParameters] | None = None,
+    odometry: tuple[WheelSamples, OdometryParameters] | None = None,
     setup_jacobian: SetupJacobian | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> InertialFit:

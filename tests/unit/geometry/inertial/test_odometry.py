@@ -19,8 +19,8 @@ from tsgt.geometry.inertial import (
 )
 from tsgt.geometry.inertial.odometry import (
     Odometry,
-    OdometrySamples,
     OdometrySteps,
+    WheelSamples,
     add_wheel_processes,
     linearise_odometry,
 )
@@ -37,7 +37,7 @@ RATE_RADPS = 0.8
 def turning(end_s: float = 2.0) -> tuple[Odometry, InertialStates, InertialSamples]:
     """Return exact odometry of a circle at 1.2 m/s, at 20 Hz, states of the IMU every 0.25 s, and its samples."""
     step_s = np.arange(0.05, end_s + 1e-9, 0.05)
-    samples = OdometrySamples(step_s, np.full(len(step_s), 0.05), np.full(len(step_s), 1.2))
+    samples = WheelSamples(step_s, np.full(len(step_s), 0.05), np.full(len(step_s), 1.2))
     odometry = Odometry.of(samples, PARAMETERS, MOUNTING, np.zeros(3))
     time_s = np.arange(0.0, end_s + 1e-9, 0.25)
     yaw = RATE_RADPS * time_s
@@ -137,7 +137,7 @@ def test_outage_with_odometry() -> None:
     moved = drive.pose_at(step_s)[0] - position
     speed = 0.98 * np.einsum("nji,nj->ni", rotation, moved)[:, 0] / 0.05
     speed[(step_s > 21.0) & (step_s < 23.0)] *= 1.3
-    wheels = OdometrySamples(step_s, np.full(len(step_s), 0.05), speed)
+    wheels = WheelSamples(step_s, np.full(len(step_s), 0.05), speed)
     time_s = np.arange(14.0, 26.0, 0.1)
     truth = drive.pose_at(time_s)[0]
     errors = []
@@ -164,7 +164,7 @@ def test_live_outage_with_odometry() -> None:
     position, rotation = drive.pose_at(np.arange(0.0, 31.0, 0.05))
     moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
     end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
-    wheels = OdometrySamples(end_s, np.full(len(end_s), 0.05), 0.98 * moved / 0.05)
+    wheels = WheelSamples(end_s, np.full(len(end_s), 0.05), 0.98 * moved / 0.05)
     errors = []
     for parameters in (None, OdometryParameters()):
         window = InertialFixedLagSmoother(imu, MotionPrior(), reference_m=np.zeros(3), odometry=parameters)

@@ -24,6 +24,7 @@ from tsgt.analysis.rts_import import (
 )
 from tsgt.analysis.setup_replacement import with_calibration, with_layout
 from tsgt.cli.import_imu import import_imu
+from tsgt.cli.import_odometry import import_odometry
 from tsgt.cli.options import (
     RECORDING_SUFFIXES,
     OutputFile,
@@ -55,6 +56,7 @@ def import_group() -> None:
 
 
 import_group.add_command(import_imu)
+import_group.add_command(import_odometry)
 
 prisms_option = click.option(
     "--prisms",

@@ -20,7 +20,15 @@ from tsgt.cli.options import path_type, resolved_point
 from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
 from tsgt.config import load_imu_mounting, load_prism_layout, load_station_calibration
-from tsgt.recording import RecordingHeader, encode_line, load_recording, read_imu_samples, write_atomically
+from tsgt.model import OdometryParameters
+from tsgt.recording import (
+    RecordingHeader,
+    encode_line,
+    load_recording,
+    read_imu_samples,
+    read_odometry,
+    write_atomically,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -89,11 +97,24 @@ def imu_options(command: Callable[..., R]) -> Callable[..., R]:
         type=path_type,
         help="Mounting, latency and gyro matrix of the IMU (tsgt calibrate imu) that replace the recorded ones.",
     )
+    @click.option(
+        "--wheel-odometry",
+        "odometry",
+        type=path_type,
+        help="Wheel odometry (tsgt import odometry) that is used with the IMU, instead of recorded one.",
+    )
     @functools.wraps(command)
-    def with_options(*, left_out: bool, samples: Path | None, setup: Path | None, **others: Any) -> R:
+    def with_options(
+        *, left_out: bool, samples: Path | None, setup: Path | None, odometry: Path | None, **others: Any
+    ) -> R:
         if left_out and (samples is not None or setup is not None):
             raise click.UsageError(f"--no-imu and --imu{'' if samples else '-setup'} exclude each other")
-        return command(imu=ImuOptions(left_out=left_out, samples=samples, setup=setup), **others)
+        if left_out and odometry is not None:
+            raise click.UsageError(
+                "--no-imu and --wheel-odometry exclude each other: wheels are used with an IMU"
+            )
+        options = ImuOptions(left_out=left_out, samples=samples, setup=setup, odometry=odometry)
+        return command(imu=options, **others)
 
     return with_options
 
@@ -105,6 +126,7 @@ class ImuOptions:
     left_out: bool = False
     samples: Path | None = None  # instead of those of the recording
     setup: Path | None = None
+    odometry: Path | None = None  # instead of that of the recording
 
     def applied(self, recording: Recording, path: Path, *, keep_going: bool) -> Recording:
         """Return the recording with these samples and parameters."""
@@ -113,6 +135,10 @@ class ImuOptions:
             parameters = dataclasses.replace(parameters, imu=None)
         if self.setup is not None:
             parameters = with_imu_mounting(parameters, load_imu_mounting(self.setup), path=self.setup)
+        if self.odometry is not None:
+            parameters = dataclasses.replace(parameters, odometry=parameters.odometry or OdometryParameters())
+            driven = read_odometry(self.odometry, keep_going=keep_going, on_problem=report_problem)
+            recording = dataclasses.replace(recording, odometry=list(driven))
         if self.samples is None:
             return dataclasses.replace(recording, parameters=parameters)
         if parameters.imu is None:

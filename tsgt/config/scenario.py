@@ -208,6 +208,8 @@ class ScenarioConfig(Model):
     """Fast shaking of the driving robot."""
     imu: SimulatedImu = SimulatedImu()
     """The robot's IMU; none by default."""
+    odometry: bool = False
+    """Whether the robot has wheel odometry, which is used with the IMU."""
     stations: Annotated[tuple[SimulatedStation, ...], unique_by("station")] = (
         SimulatedStation(station=1, prism=1, position_m=(0.0, 0.0, 0.0)),
         SimulatedStation(station=2, prism=2, position_m=(2.0, -1.5, 0.1), yaw_deg=25.0),

@@ -130,19 +130,19 @@ class _Versioned:
     imu: int
 
 
-class ImuVersionError(ValueError):
+class FormatVersionError(ValueError):
     """The program uses another version of the format: none of its lines can be used."""
 
 
 def decode_program_line(data: bytes) -> ProgramLine | None:
     """Decode a line of a program; None for an unknown type.
 
-    Raises ImuVersionError for the ``hello`` of another version, and ValueError (one line) if it is not JSON or a field
+    Raises FormatVersionError for the ``hello`` of another version, and ValueError (one line) if it is not JSON or a field
     is missing or invalid.
     """
     kind = decode(Typed, data).type
     if kind == "hello" and (version := decode(_Versioned, data).imu) != FORMAT_VERSION:
-        raise ImuVersionError(
+        raise FormatVersionError(
             f"uses version {version} of the lines of an IMU, and this master version {FORMAT_VERSION}"
         )
     return decode(_KINDS[kind], data) if kind in _KINDS else None

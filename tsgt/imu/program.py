@@ -1,25 +1,28 @@
-"""The IMU of the robot: runs the program that reads it, restarts it, and passes its samples on."""
+"""Programs that read a device of the robot, supervised; and the one that reads its IMU."""
 
 from __future__ import annotations
 
 import asyncio
+from abc import ABC, abstractmethod
 from functools import partial
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import structlog
 
 from tsgt.errors import InstrumentError
+from tsgt.imu.lines import decode_program_line
 from tsgt.imu.monitor import ImuMonitor
 from tsgt.imu.sampler import Sampler
 from tsgt.imu.session import ImuSession
 from tsgt.service import RejectedLines, printable, start_process
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.config import ImuConfig
     from tsgt.imu.lines import HelloLine
+    from tsgt.imu.sampler import DeviceSampler
     from tsgt.model import ImuSamples
     from tsgt.recording import ImuStatus
     from tsgt.service import StartProgram
@@ -36,7 +39,125 @@ CHECK_PERIOD_NS = 250_000_000  # of what time alone brings: loss, and the end of
 log = structlog.get_logger()
 
 
-class Imu:
+class DeviceProgram(ABC):
+    """A program that reads a device: run, restarted when it fails.
+
+    Parameters
+    ----------
+    setting
+        Key of the configuration that has the command.
+    decode
+        Decodes its lines.
+    start
+        Starts the program; by default as a child process.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        stall_timeout_s: float,
+        clock: Clock,
+        timeline: UnixTimeline,
+        sampler: DeviceSampler[Any, Any],
+        *,
+        setting: str,
+        decode: Callable[[bytes], Any],
+        start: StartProgram | None,
+    ) -> None:
+        self._command, self._stall_timeout_s = command, stall_timeout_s
+        self._clock = clock
+        self._timeline = timeline
+        self._sampler = sampler
+        self._decode = decode
+        self._start: StartProgram = start or partial(
+            start_process, clock=clock, setting=setting, log_stderr=self._log_stderr
+        )
+        self._rejected = RejectedLines(clock, self._log_rejected)
+        self._session: ImuSession | None = None
+        self._error = ""
+        self._started_ns = clock.monotonic_ns()
+
+    async def run(self) -> NoReturn:
+        """Run the program and restart it, for ever."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._supervise())
+            group.create_task(self._check())
+        raise AssertionError  # both run for ever
+
+    @abstractmethod
+    def _hello(self, hello: Any) -> None:
+        """Take the first line of a run."""
+
+    @abstractmethod
+    def _take(self, samples: Any) -> None:
+        """Take a record."""
+
+    @abstractmethod
+    async def _check(self) -> NoReturn:
+        """Find what time alone brings."""
+
+    @abstractmethod
+    def _log_stderr(self, text: str, dropped: int) -> None:
+        """Log what the program wrote to stderr."""
+
+    @abstractmethod
+    def _log_rejected(self, error: str, line: str, rejected: int) -> None:
+        """Log an invalid line."""
+
+    @abstractmethod
+    def _log_failed(self, error: str) -> None:
+        """Log why the program is restarted."""
+
+    def _problem_of_program(self) -> str:
+        """Return why there are no samples, as far as the program says; empty where it does not."""
+        problem = "" if self._session is None else self._session.status.problem
+        return problem or self._error or self._rejected.last
+
+    def _now_ns(self) -> int:
+        return self._timeline.unix_ns(self._clock.monotonic_ns())
+
+    def _overdue(self) -> bool:
+        """Whether the first sample has taken too long."""
+        return self._clock.monotonic_ns() - self._started_ns > round(self._stall_timeout_s * 1e9)
+
+    async def _supervise(self) -> NoReturn:
+        delay_ns, logged = INITIAL_RETRY_DELAY_NS, ""
+        while True:
+            began_ns = self._clock.monotonic_ns()
+            try:
+                await self._run_once()
+            except InstrumentError as error:
+                if (task := asyncio.current_task()) is not None and task.cancelling():
+                    raise asyncio.CancelledError from None
+                if self._clock.monotonic_ns() - began_ns > STABLE_NS:
+                    delay_ns, logged = INITIAL_RETRY_DELAY_NS, ""
+                self._error = str(error)
+                if self._error != logged:
+                    logged = self._error
+                    self._log_failed(logged)
+            await self._clock.sleep_until(self._clock.monotonic_ns() + delay_ns)
+            delay_ns = min(2 * delay_ns, MAX_RETRY_DELAY_NS)
+
+    async def _run_once(self) -> None:
+        session = self._session = ImuSession(
+            self._command[0],
+            self._clock,
+            self._sampler,
+            self._rejected,
+            stall_timeout_s=self._stall_timeout_s,
+            on_hello=self._hello,
+            on_samples=self._take,
+            decode=self._decode,
+        )
+        program = await self._start(self._command, session)
+        session.kill = program.kill
+        try:
+            await session.run()
+        finally:
+            await program.terminate()
+
+
+class Imu(DeviceProgram):
     """The robot's IMU.
 
     Parameters
@@ -59,30 +180,22 @@ class Imu:
         on_event: Callable[[str, str], None],
         start: StartProgram | None = None,
     ) -> None:
-        self._config = config
-        self._clock = clock
-        self._timeline = timeline
+        super().__init__(
+            config.command,
+            config.stall_timeout_s,
+            clock,
+            timeline,
+            Sampler(timeline.unix_at_zero_ns),
+            setting="imu.command",
+            decode=decode_program_line,
+            start=start,
+        )
         self._on_samples = on_samples
         self._on_event = on_event
-        self._start: StartProgram = start or partial(
-            start_process, clock=clock, setting="imu.command", log_stderr=_log_stderr
-        )
-        self._sampler = Sampler(timeline.unix_at_zero_ns)
         self._monitor = ImuMonitor()
-        self._rejected = RejectedLines(clock, _log_rejected)
-        self._session: ImuSession | None = None
-        self._error = ""
-        self._started_ns = clock.monotonic_ns()
         self._lost = False
         self._problem = ""
         self._clock_steps = 0
-
-    async def run(self) -> NoReturn:
-        """Run the program and restart it, for ever."""
-        async with asyncio.TaskGroup() as group:
-            group.create_task(self._supervise())
-            group.create_task(self._check())
-        raise AssertionError  # both run for ever
 
     def status(self) -> ImuStatus:
         """Return the status at present."""
@@ -91,44 +204,6 @@ class Imu:
         if self._monitor.lost(self._now_ns()):
             problem = problem or self._error or self._rejected.last or "there are no samples yet"
         return self._monitor.status(self._now_ns(), problem, self._sampler.clock_skew_ppm)
-
-    def _now_ns(self) -> int:
-        return self._timeline.unix_ns(self._clock.monotonic_ns())
-
-    async def _supervise(self) -> NoReturn:
-        delay_ns, logged = INITIAL_RETRY_DELAY_NS, ""
-        while True:
-            began_ns = self._clock.monotonic_ns()
-            try:
-                await self._run_once()
-            except InstrumentError as error:
-                if (task := asyncio.current_task()) is not None and task.cancelling():
-                    raise asyncio.CancelledError from None
-                if self._clock.monotonic_ns() - began_ns > STABLE_NS:
-                    delay_ns, logged = INITIAL_RETRY_DELAY_NS, ""
-                self._error = str(error)
-                if self._error != logged:
-                    logged = self._error
-                    log.error("imu_program_failed", error=logged)  # noqa: TRY400 (the message says it all)
-            await self._clock.sleep_until(self._clock.monotonic_ns() + delay_ns)
-            delay_ns = min(2 * delay_ns, MAX_RETRY_DELAY_NS)
-
-    async def _run_once(self) -> None:
-        session = self._session = ImuSession(
-            self._config.command[0],
-            self._clock,
-            self._sampler,
-            self._rejected,
-            stall_timeout_s=self._config.stall_timeout_s,
-            on_hello=self._hello,
-            on_samples=self._take,
-        )
-        program = await self._start(self._config.command, session)
-        session.kill = program.kill
-        try:
-            await session.run()
-        finally:
-            await program.terminate()
 
     def _hello(self, hello: HelloLine) -> None:
         name = printable(" ".join(filter(None, (hello.make, hello.model, hello.serial_number))))
@@ -165,14 +240,11 @@ class Imu:
             if not lost:
                 self._problem = problem
 
-    def _overdue(self) -> bool:
-        """Whether the first sample has taken too long."""
-        return self._clock.monotonic_ns() - self._started_ns > round(self._config.stall_timeout_s * 1e9)
+    def _log_stderr(self, text: str, dropped: int) -> None:
+        log.info("imu_stderr", text=text, dropped=dropped)
 
+    def _log_rejected(self, error: str, line: str, rejected: int) -> None:
+        log.warning("imu_line_rejected", error=error, line=line, rejected=rejected)
 
-def _log_stderr(text: str, dropped: int) -> None:
-    log.info("imu_stderr", text=text, dropped=dropped)
-
-
-def _log_rejected(error: str, line: str, rejected: int) -> None:
-    log.warning("imu_line_rejected", error=error, line=line, rejected=rejected)
+    def _log_failed(self, error: str) -> None:
+        log.error("imu_program_failed", error=error)

@@ -6,18 +6,18 @@ motion more than a missing sample does.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
 
 from tsgt.imu.device_clock import DeviceClock
-from tsgt.imu.lines import check_angular_rate, check_specific_force
+from tsgt.imu.lines import SamplesLine, check_angular_rate, check_specific_force
 from tsgt.imu.sample_times import SampleTimes
 from tsgt.model import ImuSamples
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
-    from tsgt.imu.lines import HelloLine, SamplesLine
     from tsgt.imu.sample_times import SampleTime
     from tsgt.model import Vector3
 
@@ -30,16 +30,59 @@ MAX_AHEAD_NS = 5_000_000
 MAX_PENDING_S = 10.0  # of samples that wait for the fit
 
 
+class DeviceHello(Protocol):
+    """What the first line of any program says."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Nominal rate of the samples."""
+        ...
+
+
+class DeviceLine(Protocol):
+    """What a line with the samples of any device has."""
+
+    @property
+    def counter(self) -> tuple[int, ...] | None:
+        """Number of each sample."""
+        ...
+
+    @property
+    def instrument_time_ns(self) -> tuple[int, ...] | None:
+        """End of each interval on the clock of the device."""
+        ...
+
+    @property
+    def host_time_ns(self) -> tuple[int, ...] | None:
+        """When each sample was read."""
+        ...
+
+    def __len__(self) -> int: ...
+
+
+LineT = TypeVar("LineT", bound=DeviceLine)
+RecordT = TypeVar("RecordT")
+
+
 class _Sample(NamedTuple):
     time: SampleTime
     instrument_time_ns: int | None
-    rate: Vector3
-    force: Vector3
+    values: Any
     arrived_ns: int
 
 
-class Sampler:
-    """Assigns times to the samples; outlives the program, whose runs have one sequence.
+class RecordTimes(NamedTuple):
+    """What a record says of the times of its samples, by the names of its fields."""
+
+    sequence: int
+    received_ns: int
+    stamp_ns: tuple[int, ...]
+    duration_ns: tuple[int, ...]
+    instrument_time_ns: tuple[int, ...] | None
+
+
+class DeviceSampler(ABC, Generic[LineT, RecordT]):
+    """Assigns times to the samples of a device; outlives the program, whose runs have one sequence.
 
     Attributes
     ----------
@@ -64,7 +107,15 @@ class Sampler:
         self.dropped = 0
         self.problem = ""
 
-    def program_started(self, hello: HelloLine) -> None:
+    @abstractmethod
+    def _values(self, line: LineT, index: int, duration_ns: int) -> Any:
+        """Return what a sample measured. Raises ValueError if no device measures that."""
+
+    @abstractmethod
+    def _record_of(self, times: RecordTimes, values: Sequence[Any]) -> RecordT:
+        """Return the record of samples that follow each other."""
+
+    def program_started(self, hello: DeviceHello) -> None:
         """Begin with the samples of a new run of the program."""
         self._times = SampleTimes(hello.rate_hz)
         self._clock = None
@@ -79,7 +130,7 @@ class Sampler:
         clock = self._clock
         return None if clock is None or not clock.initialised else clock.skew_ppm
 
-    def push(self, line: SamplesLine, received_ns: int) -> list[ImuSamples]:
+    def push(self, line: LineT, received_ns: int) -> list[RecordT]:
         """Take a line that arrived at this time on CLOCK_MONOTONIC; return the records that are ready.
 
         A record holds samples that follow each other without a gap. Raises ValueError if the line's host times cannot
@@ -117,7 +168,7 @@ class Sampler:
         pending, self._pending = self._pending, deque()
         return list(self._records(self._clock, pending, received_ns))
 
-    def _samples(self, line: SamplesLine, arrivals: tuple[int, ...]) -> Iterator[_Sample]:
+    def _samples(self, line: LineT, arrivals: tuple[int, ...]) -> Iterator[_Sample]:
         for i in range(len(line)):
             counter = None if line.counter is None else line.counter[i]
             instrument_time_ns = None if line.instrument_time_ns is None else line.instrument_time_ns[i]
@@ -125,15 +176,12 @@ class Sampler:
             if time is None:
                 self._drop("it repeats the one before")
                 continue
-            rate = _value(line.angular_rate_radps, line.delta_angle_rad, i, time.duration_ns)
-            force = _value(line.specific_force_mps2, line.delta_velocity_mps, i, time.duration_ns)
             try:
-                check_angular_rate([rate])
-                check_specific_force([force])
+                values = self._values(line, i, time.duration_ns)
             except ValueError as error:
                 self._drop(str(error))
                 continue
-            yield _Sample(time, instrument_time_ns, rate, force, arrivals[i])
+            yield _Sample(time, instrument_time_ns, values, arrivals[i])
 
     def _restart(self, clock: DeviceClock) -> None:
         """Begin a new fit, unless this is the first sample."""
@@ -150,7 +198,7 @@ class Sampler:
         self.problem = reason
         self._gap = True
 
-    def _records(self, clock: DeviceClock, samples: deque[_Sample], received_ns: int) -> Iterator[ImuSamples]:
+    def _records(self, clock: DeviceClock, samples: deque[_Sample], received_ns: int) -> Iterator[RecordT]:
         run: list[tuple[int, int, _Sample]] = []
         for sample in samples:
             stamp_ns = clock.stamp(sample.time.end_ns)
@@ -180,20 +228,37 @@ class Sampler:
         by_time = round((stamp_ns - self._last_stamp_ns) / self._period_ns) - 1
         return max(sample.time.lost, by_time, 0) if self._gap else sample.time.lost
 
-    def _record(self, run: list[tuple[int, int, _Sample]], received_ns: int) -> ImuSamples:
+    def _record(self, run: list[tuple[int, int, _Sample]], received_ns: int) -> RecordT:
         sequence = self._sequence
         self._sequence += len(run)
         times_ns = [
             sample.instrument_time_ns for _, _, sample in run if sample.instrument_time_ns is not None
         ]
-        return ImuSamples(
+        times = RecordTimes(
             sequence=sequence,
             received_ns=self._unix_at_zero_ns + received_ns,
             stamp_ns=tuple(self._unix_at_zero_ns + stamp_ns for stamp_ns, _, _ in run),
             duration_ns=tuple(duration_ns for _, duration_ns, _ in run),
             instrument_time_ns=tuple(times_ns) if len(times_ns) == len(run) else None,
-            angular_rate_radps=tuple(sample.rate for _, _, sample in run),
-            specific_force_mps2=tuple(sample.force for _, _, sample in run),
+        )
+        return self._record_of(times, [sample.values for _, _, sample in run])
+
+
+class Sampler(DeviceSampler[SamplesLine, ImuSamples]):
+    """The sampler of an IMU; values are angular rate and specific force."""
+
+    def _values(self, line: SamplesLine, index: int, duration_ns: int) -> tuple[Vector3, Vector3]:
+        rate = _value(line.angular_rate_radps, line.delta_angle_rad, index, duration_ns)
+        force = _value(line.specific_force_mps2, line.delta_velocity_mps, index, duration_ns)
+        check_angular_rate([rate])
+        check_specific_force([force])
+        return rate, force
+
+    def _record_of(self, times: RecordTimes, values: Sequence[tuple[Vector3, Vector3]]) -> ImuSamples:
+        return ImuSamples(
+            **times._asdict(),
+            angular_rate_radps=tuple(rate for rate, _ in values),
+            specific_force_mps2=tuple(force for _, force in values),
         )
 
 

@@ -6,26 +6,25 @@ No output stops the master, fills the memory, or becomes a sample with an imposs
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tsgt.errors import InstrumentError
 from tsgt.imu.lines import (
     MAX_LINE_BYTES,
+    FormatVersionError,
     HelloLine,
-    ImuVersionError,
-    ProgramLine,
     SamplesLine,
     StatusLine,
     decode_program_line,
 )
+from tsgt.imu.odometry_lines import OdometryHelloLine, OdometryLine
 from tsgt.service import LineSplitter, printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tsgt.clock import Clock
-    from tsgt.imu.sampler import Sampler
-    from tsgt.model import ImuSamples
+    from tsgt.imu.sampler import DeviceSampler
     from tsgt.service import RejectedLines
 
 HELLO_TIMEOUT_S = 30.0  # time for a silent program to find its device; each status restarts it
@@ -34,9 +33,12 @@ MAX_LINES_PER_S = 5_000
 _BYTES_PER_LINE = 1_000  # this many bytes count as a line, so that a line without end counts too
 """A program that prints this much has a bug, and is killed: the fastest device needs 1 MB a second."""
 
+AnyHello = HelloLine | OdometryHelloLine
+AnySamples = SamplesLine | OdometryLine
+
 
 class ImuSession:
-    """The session with one run of the program; a :class:`~tsgt.service.Listener`.
+    """The session with one run of the program of an IMU or, with another ``decode``, of wheel odometry: a :class:`~tsgt.service.Listener`.
 
     Attributes
     ----------
@@ -50,13 +52,15 @@ class ImuSession:
         self,
         name: str,
         clock: Clock,
-        sampler: Sampler,
+        sampler: DeviceSampler[Any, Any],
         rejected: RejectedLines,
         *,
         stall_timeout_s: float,
-        on_hello: Callable[[HelloLine], None],
-        on_samples: Callable[[ImuSamples], None],
+        on_hello: Callable[[Any], None],
+        on_samples: Callable[[Any], None],
+        decode: Callable[[bytes], AnyHello | AnySamples | StatusLine | None] = decode_program_line,
     ) -> None:
+        self._decode_line = decode
         self._name = name
         self._clock = clock
         self._sampler = sampler
@@ -71,7 +75,7 @@ class ImuSession:
         self._lines = 0
         self._last_use_ns = clock.monotonic_ns()
         self.kill: Callable[[], None] = lambda: None
-        self.hello: HelloLine | None = None
+        self.hello: AnyHello | None = None
         self.status = StatusLine()
 
     async def run(self) -> None:
@@ -106,7 +110,7 @@ class ImuSession:
             self._second, self._lines = at_ns // 1_000_000_000, 0
         self._lines += data.count(b"\n") + len(data) // _BYTES_PER_LINE
         if self._lines > MAX_LINES_PER_S:
-            self._fail("the program prints more than any IMU; it is restarted")
+            self._fail("the program prints more than any device; it is restarted")
         if self._error is not None:
             return
         for line in self._splitter.push(data):
@@ -118,21 +122,21 @@ class ImuSession:
         """End the session: the program has ended."""
         self._fail(f"the program has ended ({reason}); it is restarted")
 
-    def _decode(self, line: bytes) -> ProgramLine | None:
+    def _decode(self, line: bytes) -> AnyHello | AnySamples | StatusLine | None:
         try:
-            return decode_program_line(line)
-        except ImuVersionError as error:
+            return self._decode_line(line)
+        except FormatVersionError as error:
             self._fail(f"the program {error}; use one for this version")
         except ValueError as error:
             self._rejected.add(str(error), line)
         return None
 
-    def _process(self, record: ProgramLine, line: bytes, at_ns: int) -> None:
+    def _process(self, record: AnyHello | AnySamples | StatusLine, line: bytes, at_ns: int) -> None:
         if isinstance(record, StatusLine):
             self.status = StatusLine(activity=printable(record.activity), problem=printable(record.problem))
             if self.hello is None:
                 self._last_use_ns = at_ns
-        elif isinstance(record, HelloLine):
+        elif isinstance(record, AnyHello):
             if self.hello is not None:
                 self._fail("the program has sent a second hello; it is restarted")
                 return
@@ -144,7 +148,7 @@ class ImuSession:
         else:
             self._take(record, line, at_ns)
 
-    def _take(self, record: SamplesLine, line: bytes, at_ns: int) -> None:
+    def _take(self, record: AnySamples, line: bytes, at_ns: int) -> None:
         dropped = self._sampler.dropped
         try:
             records = self._sampler.push(record, at_ns)

@@ -20,7 +20,7 @@ from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.config import ClassicMasterConfig
 from tsgt.errors import RadioError, StreamError
-from tsgt.imu import Imu
+from tsgt.imu import Imu, WheelOdometry
 from tsgt.master.alarms import Alarms
 from tsgt.master.classic import ClassicLink
 from tsgt.master.imu_monitor import ImuUseMonitor
@@ -33,7 +33,7 @@ from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
 from tsgt.master.superframe import SuperframeLink
-from tsgt.model import ImuSamples
+from tsgt.model import ImuSamples, OdometrySamples
 from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import (
     EventRecord,
@@ -83,6 +83,8 @@ class MasterDependencies:
     """Called with each published record and its line."""
     start_imu: StartProgram | None = None
     """Starts the program that reads the IMU; None: as a child process."""
+    start_odometry: StartProgram | None = None
+    """Starts the program that reads the wheel odometry, likewise."""
     write: Callable[[int, memoryview], int] | None = None  # see :class:`~tsgt.recording.RecordingWriter`
     disk_status: Callable[[Path], DiskStatus | None] = disk_status
     """Returns the space on the disk of a folder; called in a thread."""
@@ -130,7 +132,7 @@ async def run_master(
                 if alarms is not None:
                     alarms.take(record)
             recording.put(line)
-            if not isinstance(record, ImuSamples):  # raw samples are for post-processing
+            if not isinstance(record, ImuSamples | OdometrySamples):  # raw samples are for post-processing
                 server.publish(line)
             dependencies.observe(record, line)
 
@@ -169,6 +171,16 @@ async def run_master(
                     group.create_task(alarms.run())
                 if imu is not None:
                     group.create_task(imu.run())
+                if config.odometry is not None:
+                    odometry = WheelOdometry(
+                        config.odometry,
+                        clock,
+                        timeline,
+                        on_samples=publisher.odometry_samples,
+                        on_event=lambda event, message: publisher.report(MasterEvent(event, message)),
+                        start=dependencies.start_odometry,
+                    )
+                    group.create_task(odometry.run())
                 radio_opener = master.with_radio_events(dependencies.open_radio)
                 group.create_task(supervise_radio(radio_opener, link.run, clock))
         finally:

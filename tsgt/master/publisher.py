@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tsgt.estimation import StartCheck
     from tsgt.master.station_events import StationEventDetector
     from tsgt.master.statistics import Statistics
-    from tsgt.model import ImuSamples, Measurement, Parameters
+    from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
     from tsgt.recording import (
         BeaconRecord,
         ClockRecord,
@@ -152,6 +152,10 @@ class Publisher:
     def imu_samples(self, samples: ImuSamples) -> None:
         """Record samples of the IMU, in the order of arrival among all other lines, after the poses due before them."""
         self._send(self._estimator.imu_samples(samples), samples.received_ns)
+
+    def odometry_samples(self, samples: OdometrySamples) -> None:
+        """Record samples of the wheel odometry likewise."""
+        self._send(self._estimator.odometry_samples(samples), samples.received_ns)
 
     def put(self, record: SetupRecord | StatusRecord | EventRecord | ClockRecord | BeaconRecord) -> None:
         """Publish a record after the poses that are due by its stamp."""

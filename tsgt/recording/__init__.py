@@ -18,7 +18,7 @@ from tsgt.recording.format import (
     encode_line,
 )
 from tsgt.recording.merged import MergedRecord
-from tsgt.recording.reader import Recording, load_recording, read_imu_samples, read_lines
+from tsgt.recording.reader import Recording, load_recording, read_imu_samples, read_lines, read_odometry
 from tsgt.recording.setup_record import (
     SETUP_START,
     SetupGeofence,
@@ -82,6 +82,7 @@ __all__ = [
     "new_recording_path",
     "read_imu_samples",
     "read_lines",
+    "read_odometry",
     "read_target_checks",
     "sync_folder",
     "write_atomically",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import (
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 
 _IMU_START = b'{"type":"imu",'  # start of every line of the IMU as it is written
+
+S = TypeVar("S", ImuSamples, OdometrySamples)
+_TAGS: dict[type, str] = {ImuSamples: "imu", OdometrySamples: "odometry"}
 
 _MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, "point": PointMeasurement}
 
@@ -170,11 +173,31 @@ def read_imu_samples(
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Iterator[ImuSamples]:
     """Yield the samples of the robot's IMU in the order of arrival; parameters and errors as of :func:`read_lines`."""
+    yield from _read_samples(ImuSamples, path, keep_going=keep_going, on_problem=on_problem)
+
+
+def read_odometry(
+    path: Path,
+    *,
+    keep_going: bool = False,
+    on_problem: Callable[[RecordingError], None] | None = None,
+) -> Iterator[OdometrySamples]:
+    """Yield the samples of the wheel odometry, as :func:`read_imu_samples`."""
+    yield from _read_samples(OdometrySamples, path, keep_going=keep_going, on_problem=on_problem)
+
+
+def _read_samples(
+    kind: type[S],
+    path: Path,
+    *,
+    keep_going: bool,
+    on_problem: Callable[[RecordingError], None] | None,
+) -> Iterator[S]:
     for line in read_lines(path, imu=True, keep_going=keep_going, on_problem=on_problem):
-        if line.type != "imu":
+        if line.type != _TAGS[kind]:
             continue
         try:
-            samples = decode_line(ImuSamples, line, path)
+            samples = decode_line(kind, line, path)
         except CorruptLineError as problem:
             if not keep_going:
                 raise

@@ -1,4 +1,7 @@
-"""Wheel odometry of the simulated robot: speed of its origin along its x axis, and its yaw rate, with scale error and slip."""
+"""Wheel odometry of the simulated robot: speed of its origin along its x axis, and its yaw rate, with scale error and slip.
+
+Incremental encoders count over an interval: a sample is the mean over the time since the one before.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,22 @@ import numpy as np
 from scipy.signal import lfilter
 
 from tsgt.geometry import rotate
+from tsgt.simulation.imu import DeviceProgram
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
+    from tsgt.clock import Clock
     from tsgt.simulation.rigid_motion import RigidMotion
+
+
+ODOMETRY_DELAY_S = 0.008
+"""From the end of a sample's interval to its earliest arrival at the host."""
+
+_MEAN_JITTER_S = 0.002
+_PARTS = 4  # Instants in an interval whose mean a sample is
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +48,10 @@ class OdometryModel:
 
 @dataclass(frozen=True, slots=True)
 class OdometrySamples:
-    """N samples of wheel odometry; instantaneous values."""
+    """N samples of wheel odometry, each the mean over the interval that ends at ``time_s``."""
 
     time_s: NDArray[np.float64]  # (N,) in s from the start of the mission
+    arrival_s: NDArray[np.float64]  # (N,) at the host
     speed_mps: NDArray[np.float64]  # (N,) of the robot's origin along its x axis, positive forwards
     yaw_rate_radps: NDArray[np.float64]  # (N,) about the robot's z axis, positive to the left
     true_speed_mps: NDArray[np.float64]  # (N,)
@@ -55,18 +68,48 @@ def simulate_odometry(
     """Simulate wheel odometry from the start of a mission to ``until_s``; ``motion_at`` covers this time."""
     rng = np.random.default_rng([*seed, 0x0D])
     time_s = np.arange(rng.uniform(0.0, 1.0 / model.rate_hz), until_s, 1.0 / model.rate_hz)
-    motion = motion_at(time_s)
-    speed = rotate(np.swapaxes(motion.rotation, 1, 2), motion.velocity_mps)[:, 0]
-    yaw_rate = motion.angular_rate_radps[:, 2]
+    parts = (np.arange(_PARTS) + 0.5) / _PARTS - 1.0
+    motion = motion_at(np.maximum(time_s[:, None] + parts / model.rate_hz, 0.0).ravel())
+    velocity = rotate(np.swapaxes(motion.rotation, 1, 2), motion.velocity_mps)
+    speed, yaw_rate = (
+        each.reshape(-1, _PARTS).mean(axis=1) for each in (velocity[:, 0], motion.angular_rate_radps[:, 2])
+    )
     scale = 1.0 + rng.normal(0.0, model.scale_error, 2) + _gauss_markov(model, len(time_s), rng)
     noise = rng.standard_normal((2, len(time_s)))
+    delay_s = ODOMETRY_DELAY_S + rng.exponential(_MEAN_JITTER_S, len(time_s))
     return OdometrySamples(
         time_s,
+        np.maximum.accumulate(time_s + delay_s),
         scale[:, 0] * speed + model.speed_noise_mps * noise[0],
         scale[:, 1] * yaw_rate + model.yaw_rate_noise_radps * noise[1],
         speed,
         yaw_rate,
     )
+
+
+class OdometryProgram(DeviceProgram):
+    """The program that reads the simulated wheel odometry; ``clock`` as for that of the IMU."""
+
+    def __init__(self, samples: OdometrySamples, clock: Clock) -> None:
+        hello: dict[str, object] = {
+            "type": "hello",
+            "odometry": 1,
+            "make": "Simulated",
+            "rate_hz": round(1.0 / float(np.median(np.diff(samples.time_s))), 6),
+            "clock": "time since start-up",
+        }
+
+        def line_of(rows: slice) -> dict[str, object]:
+            return {
+                "type": "samples",
+                "counter": list(range(len(samples.time_s)))[rows],
+                "instrument_time_ns": np.rint(samples.time_s[rows] * 1e9).astype(np.int64).tolist(),
+                "host_time_ns": np.rint(samples.arrival_s[rows] * 1e9).astype(np.int64).tolist(),
+                "speed_mps": np.round(samples.speed_mps[rows], 6).tolist(),
+                "yaw_rate_radps": np.round(samples.yaw_rate_radps[rows], 6).tolist(),
+            }
+
+        super().__init__(hello, samples.arrival_s, line_of, clock)
 
 
 def _gauss_markov(model: OdometryModel, count: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -31,7 +31,7 @@ _PARAMETERS_START = b'{"type":"parameters",'
 _EVENT_START = b'{"type":"event",'
 _POSE_START = b'{"type":"pose",'
 _PREDICTED = b'"kind":"predicted"'
-_ARRIVED = (b'{"type":"measurement",', b'{"type":"point",', b'{"type":"imu",')
+_ARRIVED = (b'{"type":"measurement",', b'{"type":"point",', b'{"type":"imu",', b'{"type":"odometry",')
 _MADE_AT_ONCE = (b'{"type":"status",', b'{"type":"beacon",', b'{"type":"clock",', SETUP_START, _EVENT_START)
 
 INDEX_INTERVAL_S = 1.0

@@ -29,7 +29,7 @@ PROBLEMS = {
     ),
     "unknown key near no other": (
         ("[recording]", "[zzz]"),
-        "zzz: unknown key; known keys: kind, setup, stations, radio, protocol, pipeline, reference_point, imu, frame_watch, geofences, alarms, stream",
+        "zzz: unknown key; known keys: kind, setup, stations, radio, protocol, pipeline, reference_point, imu, odometry, frame_watch, geofences, alarms, stream",
     ),
     "unknown key inside a table in an array": (
         ("range_sigma_ppm", "range_sigma_pm"),

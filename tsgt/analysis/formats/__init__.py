@@ -26,6 +26,7 @@ from tsgt.analysis.formats.target_file import (
     read_prism_file,
     read_target_file,
 )
+from tsgt.analysis.formats.wheel_files import read_wheel_files, wheel_records
 
 __all__ = [
     "QUALITIES",
@@ -53,10 +54,12 @@ __all__ = [
     "read_stationary_intervals",
     "read_target_file",
     "read_tracks",
+    "read_wheel_files",
     "tracked_prisms",
     "tum_lines",
     "valid_records",
     "valid_rows",
+    "wheel_records",
     "write_imu_mounting",
     "write_mcap",
     "write_prism_layout",

@@ -88,6 +88,9 @@ protocol_option = click.option(
         default=None,
         help="Class of the robot's IMU; with one, the robot is shaken while it drives.  [default: that of the scenario]",
     ),
+    click.option(
+        "--odometry", is_flag=True, help="The robot has wheel odometry, too, which is used with its IMU."
+    ),
     model_option(
         ScenarioRadioConfig,
         "loss_probability",
@@ -151,6 +154,7 @@ def simulate_command(
     duration_s: float | None,
     stations: int | None,
     model: ImuModelName | None,
+    odometry: bool,
     loss_probability: float | None,
     clock_filter: Literal["regression", "paper"] | None,
     unauthenticated: bool,
@@ -185,6 +189,12 @@ def simulate_command(
         scenario = with_stations(scenario, stations)
     if model is not None:
         scenario = scenario.model_copy(update={"imu": scenario.imu.model_copy(update={"model": model})})
+    if odometry:
+        if scenario.imu.model == "none":
+            raise click.UsageError(
+                "--odometry is used with an IMU, and the robot has none; add --imu industrial"
+            )
+        scenario = scenario.model_copy(update={"odometry": True})
     if estimator is not None:
         pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
         scenario = scenario.model_copy(update={"pipeline": pipeline})

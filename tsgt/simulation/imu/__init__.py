@@ -16,7 +16,7 @@ from tsgt.simulation.imu.conditions import (
 )
 from tsgt.simulation.imu.environment import Environment
 from tsgt.simulation.imu.presets import CONSUMER, IMU_MODELS, INDUSTRIAL, ImuModel
-from tsgt.simulation.imu.program import ImuProgram
+from tsgt.simulation.imu.program import DeviceProgram, ImuProgram
 from tsgt.simulation.imu.samples import DeviceSamples, ImuTruth, Mounting, SimulatedImuRun
 from tsgt.simulation.imu.synthesis import ideal_samples, mounting_of, simulate_imu
 
@@ -25,6 +25,7 @@ __all__ = [
     "IMU_MODELS",
     "INDUSTRIAL",
     "DeviceClockJump",
+    "DeviceProgram",
     "DeviceSamples",
     "Dropout",
     "Environment",

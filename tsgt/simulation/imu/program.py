@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -24,27 +24,24 @@ MAX_WAIT_S: Final = 0.030
 """An incomplete line is printed when a sample arrives this long after its first one."""
 
 
-class ImuProgram:
-    """Starts the program any number of times; it prints the samples that arrive while it runs.
+class DeviceProgram:
+    """Starts a program that reads a device any number of times; it prints the samples that arrive while it runs.
 
-    ``clock`` shows true time as CLOCK_MONOTONIC, as the master's does. ``hello``: its first line.
+    ``hello``: its first line. ``arrival_s``: of each sample at the host. ``line_of``: returns the line of some samples.
+    ``clock`` shows true time as CLOCK_MONOTONIC, as the master's does.
     """
 
-    def __init__(self, model: ImuModel, samples: DeviceSamples, clock: Clock) -> None:
+    def __init__(
+        self,
+        hello: dict[str, object],
+        arrival_s: NDArray[np.float64],
+        line_of: Callable[[slice], dict[str, object]],
+        clock: Clock,
+    ) -> None:
         self._clock = clock
-        self.hello = _encoded(
-            {
-                "type": "hello",
-                "imu": 1,
-                "make": "Simulated",
-                "rate_hz": model.rate_hz,
-                "clock": "time since start-up",
-                "angular_rate_limit_radps": model.gyro_range_radps,
-                "specific_force_limit_mps2": model.accelerometer_range_mps2,
-            }
-        )
-        self._samples = samples
-        self._starts = _line_starts(samples.arrival_s)
+        self.hello = _encoded(hello)
+        self._arrival_s, self._line_of = arrival_s, line_of
+        self._starts = _line_starts(arrival_s)
 
     async def start(self, _command: Sequence[str], listener: Listener) -> RunningImuProgram:
         """Start the program."""
@@ -59,18 +56,31 @@ class ImuProgram:
 
     def lines(self, from_s: float = 0.0) -> Iterator[tuple[int, bytes]]:
         """Yield the lines from a time on, each with its arrival in ns from the start."""
-        arrival_s = self._samples.arrival_s
+        arrival_s = self._arrival_s
         first = int(np.searchsorted(arrival_s, from_s))
         line = int(np.searchsorted(self._starts, first, side="right"))
         for end in [*self._starts[line:].tolist(), len(arrival_s)]:
             if end > first:
-                yield round(arrival_s[end - 1] * 1e9), self._line(slice(first, end))
+                yield round(arrival_s[end - 1] * 1e9), _encoded(self._line_of(slice(first, end)))
             first = end
 
-    def _line(self, rows: slice) -> bytes:
-        samples = self._samples
-        return _encoded(
-            {
+
+class ImuProgram(DeviceProgram):
+    """The program that reads the simulated IMU."""
+
+    def __init__(self, model: ImuModel, samples: DeviceSamples, clock: Clock) -> None:
+        hello: dict[str, object] = {
+            "type": "hello",
+            "imu": 1,
+            "make": "Simulated",
+            "rate_hz": model.rate_hz,
+            "clock": "time since start-up",
+            "angular_rate_limit_radps": model.gyro_range_radps,
+            "specific_force_limit_mps2": model.accelerometer_range_mps2,
+        }
+
+        def line_of(rows: slice) -> dict[str, object]:
+            return {
                 "type": "samples",
                 "counter": samples.counter[rows].tolist(),
                 "instrument_time_ns": samples.device_ns[rows].tolist(),
@@ -78,7 +88,8 @@ class ImuProgram:
                 "angular_rate_radps": np.round(samples.angular_rate_radps[rows], 9).tolist(),
                 "specific_force_mps2": np.round(samples.specific_force_mps2[rows], 9).tolist(),
             }
-        )
+
+        super().__init__(hello, samples.arrival_s, line_of, clock)
 
 
 class RunningImuProgram:

@@ -12,6 +12,7 @@ from tsgt.config import (
     JournalConfig,
     LeicaInstrumentConfig,
     MasterConfig,
+    OdometryConfig,
     RecordingConfig,
     SetupConfig,
     SimulatedRadioConfig,
@@ -21,6 +22,7 @@ from tsgt.config import (
 )
 from tsgt.simulation.mission.authors_node import AUTHORS_TIMESTAMP_DELAY_MS
 from tsgt.simulation.mission.computer import MASTER
+from tsgt.simulation.wheel_odometry import ODOMETRY_DELAY_S
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -74,6 +76,7 @@ def master_config(scenario: ScenarioConfig, options: SimulationOptions, folder: 
         radio=radio_config(scenario, MASTER, folder),
         protocol=options.protocol,
         imu=_imu_config(scenario),
+        odometry=_odometry_config(scenario),
         pipeline=scenario.pipeline,
         reference_point=scenario.reference_point,
         stream=StreamConfig(socket=folder / "poses.sock"),
@@ -91,6 +94,15 @@ def _imu_config(scenario: ScenarioConfig) -> ImuConfig | None:
         orientation_xyzw=imu.orientation_xyzw,
         latitude_deg=imu.latitude_deg,
         height_m=imu.height_m,
+    )
+
+
+def _odometry_config(scenario: ScenarioConfig) -> OdometryConfig | None:
+    if not scenario.odometry or scenario.imu.model == "none":
+        return None
+    return OdometryConfig(
+        command=("simulated-odometry",),  # not run either
+        latency_ms=1e3 * ODOMETRY_DELAY_S,
     )
 
 

@@ -34,6 +34,7 @@ from tsgt.simulation.mission.daemon_configs import (
     station_name,
 )
 from tsgt.simulation.mission.run_log import START_UNIX_NS, MasterLog, ObservedInstrument, StationLog
+from tsgt.simulation.wheel_odometry import OdometryModel, OdometryProgram, simulate_odometry
 from tsgt.simulation.world import is_shaken, scenario_world
 from tsgt.station import ClientDependencies, ClientStatus, run_client
 
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.imu import ImuCondition, SimulatedImuRun
     from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.options import Outage, SimulationOptions
+    from tsgt.simulation.wheel_odometry import OdometrySamples
     from tsgt.simulation.world import World
     from tsgt.station import Reading
 
@@ -113,6 +115,13 @@ class Mission:
                 conditions=imu_conditions,
             )
             self.parameters = replace(self.parameters, imu=self.imu.parameters)
+        self.odometry: OdometrySamples | None = None
+        wheels = master_config(scenario, options, folder).odometry
+        if wheels is not None:
+            self.odometry = simulate_odometry(
+                OdometryModel(), self.world.motion_at, options.duration_s + DRAIN_S, seed=[options.seed]
+            )
+            self.parameters = replace(self.parameters, odometry=wheels.parameters())
         self._positions_m = {station_name(s.station): s.position_m for s in scenario.stations}
         self._positions_m[INTERFERER] = _INTERFERER_POSITION_M
         self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._positions_m, air_rng))
@@ -227,6 +236,9 @@ class Mission:
         start_imu = None
         if self.imu is not None:
             start_imu = ImuProgram(IMU_MODELS[self._scenario.imu.model], self.imu.samples, self.clock).start
+        start_odometry = None
+        if self.odometry is not None:
+            start_odometry = OdometryProgram(self.odometry, self.clock).start
         folder.mkdir()
         computer = self.computers[MASTER]
         computer.start(
@@ -241,6 +253,7 @@ class Mission:
                     random_bits=self._random_bits,
                     observe=master_log.observe,
                     start_imu=start_imu,
+                    start_odometry=start_odometry,
                     write=computer.new_writer(),
                     disk_status=lambda _folder: computer.disk.status(),
                 ),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.estimation import transform_of
-from tsgt.model import ImuSamples, PolarMeasurement
+from tsgt.model import ImuSamples, OdometrySamples, PolarMeasurement
 from tsgt.recording import BeaconRecord, ClockRecord, PoseRecord, StatusRecord, decode_line, read_lines
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
 from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
@@ -109,7 +109,7 @@ class MasterLog:
 
     def observe(self, record: object, line: bytes) -> None:
         """Log a published record and its line."""
-        if isinstance(record, ImuSamples):
+        if isinstance(record, ImuSamples | OdometrySamples):
             return  # recorded, not on the stream
         self.line_hashes.append(hash(line))
         if isinstance(record, PolarMeasurement):

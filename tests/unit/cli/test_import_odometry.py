@@ -1,0 +1,46 @@
+"""Importing wheel odometry that another program recorded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from harness.cli import called
+
+from tsgt.recording import read_odometry
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def write_table(path: Path, columns: str = "stamp_ns,speed_mps,yaw_rate_radps") -> Path:
+    """Write samples at 20 Hz, two of which are missing."""
+    rows = [f"{START_NS + n * 50_000_000},{n / 100},0.1" for n in range(50) if n not in (20, 21)]
+    path.write_text("\n".join([columns, *rows]) + "\n")
+    return path
+
+
+def test_table_becomes_lines_of_odometry(tmp_path: Path) -> None:
+    """Times with the offset, means over the intervals, missing samples counted."""
+    output = tmp_path / "odometry.jsonl"
+    result = called(
+        "import", "odometry", write_table(tmp_path / "wheels.csv"), "--offset-ms", "2", "--output", output
+    )
+    assert result.code == 0, result.err
+    records = list(read_odometry(output))
+    assert sum(len(each.stamp_ns) for each in records) == 48
+    assert records[0].stamp_ns[0] == START_NS + 2_000_000
+    assert records[0].speed_mps[:2] == (0.0, 0.01)
+    assert records[0].yaw_rate_radps is not None
+    assert {duration for each in records for duration in each.duration_ns} == {50_000_000}
+    last = records[-1]
+    assert last.sequence + len(last.stamp_ns) == 50
+
+
+def test_table_without_speed_is_rejected(tmp_path: Path) -> None:
+    """The error names the column."""
+    table = write_table(tmp_path / "wheels.csv", "stamp_ns,velocity,yaw_rate_radps")
+    result = called("import", "odometry", table, "--output", tmp_path / "odometry.jsonl")
+    assert result.code == 1
+    assert "speed_mps" in result.err

@@ -1,0 +1,108 @@
+"""The wheel odometry of the robot: runs the program that reads it, and passes its samples on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NoReturn
+
+import structlog
+
+from tsgt.imu.odometry_lines import OdometryHelloLine, OdometryLine, check_speed, decode_odometry_line
+from tsgt.imu.program import CHECK_PERIOD_NS, DeviceProgram
+from tsgt.imu.sampler import DeviceSampler, RecordTimes
+from tsgt.model import OdometrySamples
+from tsgt.service import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from tsgt.clock import Clock, UnixTimeline
+    from tsgt.config import OdometryConfig
+    from tsgt.service import StartProgram
+
+LOSS_TIMEOUT_NS = 1_000_000_000  # as for the IMU
+
+log = structlog.get_logger()
+
+
+class OdometrySampler(DeviceSampler[OdometryLine, OdometrySamples]):
+    """Assigns times to the samples; values are speed, yaw rate if there is one, and validity."""
+
+    def _values(self, line: OdometryLine, index: int, duration_ns: int) -> tuple[float, float | None, bool]:
+        if line.speed_mps is not None:
+            speed = line.speed_mps[index]
+        else:
+            assert line.distance_m is not None  # noqa: S101 (a line has one of both)
+            speed = line.distance_m[index] / (duration_ns / 1e9)
+        check_speed(speed)
+        rate = None if line.yaw_rate_radps is None else line.yaw_rate_radps[index]
+        return speed, rate, line.valid is None or line.valid[index]
+
+    def _record_of(
+        self, times: RecordTimes, values: Sequence[tuple[float, float | None, bool]]
+    ) -> OdometrySamples:
+        rates = [rate for _, rate, _ in values if rate is not None]
+        return OdometrySamples(
+            **times._asdict(),
+            speed_mps=tuple(speed for speed, _, _ in values),
+            yaw_rate_radps=tuple(rates) if len(rates) == len(values) else None,
+            valid=tuple(valid for _, _, valid in values),
+        )
+
+
+class WheelOdometry(DeviceProgram):
+    """The robot's wheel odometry; parameters as of :class:`~tsgt.imu.Imu`."""
+
+    def __init__(
+        self,
+        config: OdometryConfig,
+        clock: Clock,
+        timeline: UnixTimeline,
+        *,
+        on_samples: Callable[[OdometrySamples], None],
+        on_event: Callable[[str, str], None],
+        start: StartProgram | None = None,
+    ) -> None:
+        super().__init__(
+            config.command,
+            config.stall_timeout_s,
+            clock,
+            timeline,
+            OdometrySampler(timeline.unix_at_zero_ns),
+            setting="odometry.command",
+            decode=decode_odometry_line,
+            start=start,
+        )
+        self._on_samples = on_samples
+        self._on_event = on_event
+        self._newest_ns: int | None = None
+        self._lost = False
+
+    def _hello(self, hello: OdometryHelloLine) -> None:
+        name = printable(" ".join(filter(None, (hello.make, hello.model, hello.serial_number))))
+        log.info("odometry_connected", device=name, rate_hz=hello.rate_hz, clock=printable(hello.clock))
+
+    def _take(self, samples: OdometrySamples) -> None:
+        self._error = ""
+        self._newest_ns = samples.stamp_ns[-1]
+        self._on_samples(samples)
+
+    async def _check(self) -> NoReturn:
+        while True:
+            await self._clock.sleep_until(self._clock.monotonic_ns() + CHECK_PERIOD_NS)
+            lost = self._newest_ns is None or self._now_ns() - self._newest_ns > LOSS_TIMEOUT_NS
+            if lost and not self._lost and self._overdue():
+                self._lost = True
+                problem = self._problem_of_program() or "there are no samples"
+                self._on_event("odometry_lost", f"the wheel odometry gives no samples: {problem}")
+            elif self._lost and not lost:
+                self._lost = False
+                self._on_event("odometry_recovered", "the wheel odometry gives samples again")
+
+    def _log_stderr(self, text: str, dropped: int) -> None:
+        log.info("odometry_stderr", text=text, dropped=dropped)
+
+    def _log_rejected(self, error: str, line: str, rejected: int) -> None:
+        log.warning("odometry_line_rejected", error=error, line=line, rejected=rejected)
+
+    def _log_failed(self, error: str) -> None:
+        log.error("odometry_program_failed", error=error)

@@ -1,0 +1,115 @@
+"""The JSON lines of the program that reads the wheel odometry: those of an IMU's but for the samples. Sans-I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from tsgt.imu.lines import MAX_SAMPLES_PER_LINE, Counts, FormatVersionError, StatusLine
+from tsgt.recording import Typed, decode
+
+ODOMETRY_FORMAT_VERSION = 1  # changes when a master of the old version would misunderstand the new one
+
+MAX_SPEED_MPS = 50.0  # no ground robot is faster: a larger number has another unit
+
+MAX_YAW_RATE_RADPS = 20.0
+
+_MIN_RATE_HZ, _MAX_RATE_HZ = 1.0, 1_000.0
+
+Numbers = Annotated[tuple[float, ...], Field(max_length=MAX_SAMPLES_PER_LINE)] | None
+Flags = Annotated[tuple[bool, ...], Field(max_length=MAX_SAMPLES_PER_LINE)] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryHelloLine:
+    """The program's first line: version of the format, identity of the device, rate of its samples."""
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["hello"] = "hello"
+    odometry: int
+    make: str
+    model: str = ""
+    serial_number: str = ""
+    firmware: str = ""
+    rate_hz: Annotated[float, Field(ge=_MIN_RATE_HZ, le=_MAX_RATE_HZ)]
+    clock: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryLine:
+    """Consecutive samples: lists with one entry per sample."""
+
+    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+
+    type: Literal["samples"] = "samples"
+    counter: Counts = None
+    instrument_time_ns: Counts = None
+    host_time_ns: Counts = None
+    speed_mps: Numbers = None
+    distance_m: Numbers = None
+    yaw_rate_radps: Numbers = None
+    valid: Flags = None
+
+    def __post_init__(self) -> None:
+        """Reject lines that leave time or motion open, and values that have another unit."""
+        if self.counter is None and self.instrument_time_ns is None:
+            raise ValueError("neither counter nor instrument_time_ns, without which samples have no time")
+        if (self.speed_mps is None) == (self.distance_m is None):
+            raise ValueError("expected either speed_mps or distance_m")
+        lists = (
+            self.counter,
+            self.instrument_time_ns,
+            self.host_time_ns,
+            self.speed_mps,
+            self.distance_m,
+            self.yaw_rate_radps,
+            self.valid,
+        )
+        lengths = {len(each) for each in lists if each is not None}
+        if len(lengths) > 1 or 0 in lengths:
+            raise ValueError("the lists have different lengths, or none has an entry")
+        for speed in self.speed_mps or ():
+            check_speed(speed)
+        for rate in self.yaw_rate_radps or ():
+            if abs(rate) > MAX_YAW_RATE_RADPS:
+                raise ValueError(f"a yaw rate of {rate:g}; expected rad/s, at most {MAX_YAW_RATE_RADPS:g}")
+
+    def __len__(self) -> int:
+        return len(self.counter or self.instrument_time_ns or ())
+
+
+OdometryProgramLine = OdometryHelloLine | OdometryLine | StatusLine
+
+_KINDS: dict[str, type[OdometryProgramLine]] = {
+    "hello": OdometryHelloLine,
+    "samples": OdometryLine,
+    "status": StatusLine,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Versioned:
+    odometry: int
+
+
+def decode_odometry_line(data: bytes) -> OdometryProgramLine | None:
+    """Decode a line of a program; None for an unknown type.
+
+    Raises FormatVersionError for the ``hello`` of another version, and ValueError (one line) if it is not JSON or a field
+    is missing or invalid.
+    """
+    kind = decode(Typed, data).type
+    if kind == "hello" and (version := decode(_Versioned, data).odometry) != ODOMETRY_FORMAT_VERSION:
+        raise FormatVersionError(
+            f"uses version {version} of the lines of odometry, and this master version {ODOMETRY_FORMAT_VERSION}"
+        )
+    return decode(_KINDS[kind], data) if kind in _KINDS else None
+
+
+def check_speed(speed_mps: float) -> None:
+    """Reject a speed that no robot has; the message names the unit."""
+    if abs(speed_mps) > MAX_SPEED_MPS:
+        raise ValueError(f"a speed of {speed_mps:g}; expected m/s, at most {MAX_SPEED_MPS:g}")

@@ -90,7 +90,7 @@ function check() {
   const now_ms = performance.now();
   const quiet = now_ms - Math.max(received_ms, opened_ms) > RECONNECT_MS;
   if (!source ? now_ms - opened_ms > 1000 : quiet || late_ms > RECONNECT_MS) { late_ms = 0; received_ms = Math.min(received_ms, now_ms - SILENCE_LIMIT_MS - 1); connect(query()); }
-  show();
+  if (!view || verdict() !== view.verdict) show(); // else the last message has been shown
 }
 
 // --- showing ---------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ function child(parent, name, content = "", className = "") {
 // A screen reader hears the verdict when it changes, not each time a number in it does.
 function speak(now, level) {
   const said = `${now.words}: ${now.cause}`;
-  const essence = said.replace(/[0-9.]+/g, "");
+  const essence = said.replace(/[0-9.]+ (s|min|h|m|mm|MB|deg|lines)\b/g, "");
   if (essence === shown) return;
   shown = essence;
   text(find("spoken"), said);
@@ -378,6 +378,12 @@ function beep(rank) {
   sounded = performance.now();
 }
 
+// What must not be overheard sounds again and again.
+function remind() {
+  const now = verdict(), rank = LEVELS[now.words].rank;
+  if (audio && (rank > 1 || now.urgent) && performance.now() - sounded > 5000) beep(rank);
+}
+
 let theme = "device";
 function setTheme(name) {
   theme = name;
@@ -396,7 +402,7 @@ let stored = null;
 try { stored = localStorage.getItem("theme"); } catch { /* private window */ }
 setTheme(["light", "dark"].includes(stored) ? stored : "device");
 showEvents();
-setInterval(() => { check(); if (audio && LEVELS[verdict().words].rank > 1 && performance.now() - sounded > 5000) beep(LEVELS[verdict().words].rank); }, CHECK_MS);
+setInterval(() => { check(); remind(); }, CHECK_MS);
 document.addEventListener("visibilitychange", show);
 window.addEventListener("resize", show);
 connect();

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 REFRESH_S = 0.25
 
-_GAP = "  "
+MAX_GAP = 2  # characters between blocks; none on 80 columns
 
 
 class Show(Protocol):
@@ -72,12 +72,13 @@ def layout(
 
     Lines may be styled by escape sequences; they are as wide as they are printed.
     """
-    per_row = max(1, (width + len(_GAP)) // (WIDTH + len(_GAP)))
+    per_row = max(1, width // WIDTH)
+    column = min(width // per_row, WIDTH + MAX_GAP)
     lines = list(headlines)
     for first in range(0, len(blocks), per_row):
         lines.append("")
         lines += (
-            _GAP.join(_padded(line) for line in beside).rstrip()
+            "".join(_padded(line, column) for line in beside).rstrip()
             for beside in itertools.zip_longest(*blocks[first : first + per_row], fillvalue="")
         )
     space = height - len(lines) - 1
@@ -86,8 +87,8 @@ def layout(
     return lines[:height]
 
 
-def _padded(line: str) -> str:
-    return line + " " * max(0, WIDTH - Text.from_ansi(line).cell_len)
+def _padded(line: str, width: int) -> str:
+    return line + " " * max(0, width - Text.from_ansi(line).cell_len)
 
 
 def _cropped(text: str, width: int) -> str:

@@ -72,15 +72,17 @@ def main() -> None:
             "--listen", f"127.0.0.1:{PORT}", *(tls if options.tls else []),
         ]  # fmt: skip
         with subprocess.Popen(command, stderr=subprocess.DEVNULL) as relay:
-            wait_for(PORT)
-            before = processor_s(relay.pid)
-            source = f"relay{'s' if options.tls else ''}://127.0.0.1:{PORT}"
-            delays = asyncio.run(
-                measure(source, options.socket, folder / "key", options.readers, options.seconds)
-            )
-            used_s = processor_s(relay.pid) - before
-            status = Path(f"/proc/{relay.pid}/status").read_text()
-            relay.terminate()
+            try:
+                wait_for(PORT)
+                before = processor_s(relay.pid)
+                source = f"relay{'s' if options.tls else ''}://127.0.0.1:{PORT}"
+                delays = asyncio.run(
+                    measure(source, options.socket, folder / "key", options.readers, options.seconds)
+                )
+                used_s = processor_s(relay.pid) - before
+                status = Path(f"/proc/{relay.pid}/status").read_text()
+            finally:
+                relay.terminate()
     memory = re.search(r"VmRSS:\s+(\d+)", status)
     assert memory is not None  # noqa: S101 (the kernel writes it)
     print(

@@ -540,7 +540,9 @@ class Stream {
       if (!connecting_ || connected(until)) receive(until);
     } catch (const detail::Lost& lost) {
       disconnect();
-      if (at_key_ && !was_ready_) throw Error(source_ + ": the relay has another key, or has seen too many wrong ones");
+      failures_at_key_ = at_key_ ? failures_at_key_ + 1 : 0;  // the first time, the relay may have been busy
+      at_key_ = false;
+      if (failures_at_key_ >= 2 && !was_ready_) throw Error(source_ + ": the relay has another key, or has seen too many wrong ones");
       problem_ = source_ + ": " + lost.what();
       retry_ = monotonic_ns() + back_off_;
       back_off_ = std::min(2 * back_off_, detail::kMaxBackOff);
@@ -772,7 +774,7 @@ class Stream {
 
   std::string source_, host_, port_, key_, line_key_, stream_, challenge_, request_, received_, problem_;
   bool resume_, connecting_ = false, more_ = false, ready_ = false, was_ready_ = false, at_key_ = false, greeted_ = false;
-  int socket_ = -1, connections_ = 0;
+  int socket_ = -1, connections_ = 0, failures_at_key_ = 0;
   std::int64_t next_ = 0, last_beat_ = 0, heard_ = 0, retry_ = 0, back_off_ = detail::kFirstBackOff;
   detail::LeastDelay session_, network_;
   std::deque<Record> records_;

@@ -33,6 +33,9 @@ BACK_OFF_S = (0.1, 2.0)
 CONNECT_TIMEOUT_NS = 5_000_000_000
 """For everything until the first line."""
 
+MAX_FAILURES_AT_KEY = 2
+"""A relay that closes the connection at the proof of the key may have been busy; when it does again, the key is wrong."""
+
 RECEIVE_BYTES = 1 << 16
 
 MAX_RECEIVES = 2
@@ -90,6 +93,7 @@ class Pump:
         self._attempts = 0
         self._received_ns = 0
         self._was_ready = False
+        self._failures_at_key = 0
         self._logged: set[str] = set()
         self.ended = False
         """Whether nothing will follow."""
@@ -194,6 +198,7 @@ class Pump:
                 raise StreamError("the stream has ended")
             self._received_ns = self._now_ns()
             self._take(data, records)
+        self._send()
         self.more = True
 
     def _take(self, data: bytes, records: list[Record]) -> None:
@@ -254,11 +259,11 @@ class Pump:
             raise StreamError("nothing arrives")
 
     def _lost(self, error: OSError) -> None:
-        at_key = self._link.failed_at_key and not self._was_ready
+        self._failures_at_key = self._failures_at_key + 1 if self._link.failed_at_key else 0
         self._disconnect()
         reason = str(error) if isinstance(error, StreamError) else error.strerror or str(error)
         problem = f"{self._source}: {reason}"
-        if at_key:
+        if self._failures_at_key >= MAX_FAILURES_AT_KEY and not self._was_ready:
             self.ended = True
             raise AuthenticationError(
                 f"{self._source}: the relay has another key, or has seen too many attempts with wrong ones"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.records import HELLO, POSE, SETUP
 
-from tsgt.client import AsyncStream, AuthenticationError, Event, Gap, Hello, Pose, Setup
+from tsgt.client import AsyncStream, AuthenticationError, Event, Gap, Hello, Pose, Setup, pump
 from tsgt.client.records import monotonic_ns
 from tsgt.client.tls import relay_context
 from tsgt.recording import encode_line
@@ -52,8 +52,9 @@ async def relay(
 
 async def readers(server: RelayServer, count: int) -> None:
     """Return when the server has this number of readers."""
-    while len(server.readers) < count:  # noqa: ASYNC110 (the server has no event for it)
-        await asyncio.sleep(0.001)
+    async with asyncio.timeout(5):
+        while len(server.readers) < count:  # noqa: ASYNC110 (the server has no event for it)
+            await asyncio.sleep(0.001)
 
 
 async def taken(stream: AsyncStream, count: int) -> list[Record]:
@@ -105,6 +106,17 @@ def test_tls_carries_the_same(certificate: tuple[ssl.SSLContext, str]) -> None:
         async with relay(certificate) as server:
             found = await _read_all(server, "relays")
         assert [type(record) for record in found] == [Hello, Setup, Pose, Pose, Pose]
+
+    asyncio.run(main())
+
+
+def test_tls_in_many_pieces(certificate: tuple[ssl.SSLContext, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the reader has to say is sent also when it stops receiving for now."""
+    monkeypatch.setattr(pump, "MAX_RECEIVES", 1)
+
+    async def main() -> None:
+        async with relay(certificate) as server:
+            await _read_all(server, "relays")
 
     asyncio.run(main())
 

@@ -131,6 +131,15 @@ class RosSystem:
         self._connection.sendall(data)
         return now
 
+    def stale_poses(self) -> int:
+        """Return how many poses the node has left out because they were too old, by its newest diagnostics."""
+        (pose,) = (
+            each
+            for each in self.messages("/diagnostics")[-1].message["status"]
+            if each["name"] == "tsgt: pose"
+        )
+        return int(next(each["value"] for each in pose["values"] if each["key"] == "stale_poses"))
+
     def messages(self, topic: str) -> list[Received]:
         """Return what the subscriber has received on a topic so far."""
         return [received for received in list(self._received) if received.topic == topic]

@@ -78,6 +78,7 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
         self._setup: Setup | None = None
         self._status: Status | None = None
         self._pose: Pose | None = None
+        self._stale_poses = 0
         self._arrived_ns = 0
         self.stream: Stream | None = None
         self.create_timer(1.0, self._publish_diagnostics)
@@ -103,6 +104,7 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
         self._pose = pose
         position, orientation = pose.position_m, pose.orientation_xyzw
         stale = pose.age_s() > default_max_age_s(pose)
+        self._stale_poses += stale
         if not pose.valid or stale or position is None or orientation is None:
             return
         stamp = self._time(pose.stamp_ns, pose.age_s())
@@ -175,7 +177,7 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
                 why = f"no line for {silent_s:.0f} s" if self._arrived_ns else "no line yet"
             statuses = [_stream_diagnosis(self.source, why)]
             if self._pose is not None:
-                statuses.append(_pose_diagnosis(self._pose))
+                statuses.append(_pose_diagnosis(self._pose, self._stale_poses))
             if self._status is not None:
                 statuses += [_station_diagnosis(station) for station in self._status.stations]
         if why:
@@ -243,7 +245,7 @@ def _stream_diagnosis(source: str, problem: str) -> Any:
     return _diagnosis("stream", level, problem or "connected", source=source)
 
 
-def _pose_diagnosis(pose: Pose) -> Any:
+def _pose_diagnosis(pose: Pose, stale_poses: int) -> Any:
     if not pose.valid:
         level, message = DiagnosticStatus.ERROR, f"invalid: {pose.reason}"
     elif pose.quality == "degraded":
@@ -258,6 +260,7 @@ def _pose_diagnosis(pose: Pose) -> Any:
         age_s=f"{pose.age_s():.3f}",
         residual_m=pose.residual_m,
         imu=pose.imu,
+        stale_poses=stale_poses,
     )
 
 

@@ -31,7 +31,7 @@ LIMIT_CHANCE = 1e-9
 """Probability that as many values as show a limit are the same by chance: noise changes successive values by some of their steps."""
 MIN_CHANCE, STEP_SHARE = 1e-3, 0.5
 """Probability that two values are the same: this share of their step over their noise, at least the first."""
-LIMIT_STEPS = 20  # Below a limit, in which fewer values must be than at it
+LIMIT_STEPS = 20  # On both sides of a limit, in which less than half as many values must be as at it
 MIN_MOTION_STEPS = 40  # Spread of values that change, so that repeated ones are none of a robot at rest
 MIN_LIMITS = np.repeat(
     [0.04, 5.0], 3
@@ -72,8 +72,8 @@ class HealthMonitor:
     prism that disagrees is an error of its station. Two that do within :data:`DISAGREEMENT_S` are an error of the IMU: the
     trajectory is as certain of one station as of the others.
 
-    An axis is at its limit where values repeat exactly that its motion and its noise ought to change: successive ones, or the
-    largest of the last half second.
+    An axis is at its limit where values repeat exactly that its motion and its noise ought to change: successive ones, or any
+    of the last half second.
 
     ``setup_in_doubt``: the mounting may have changed, by a blow or whatever made the samples disagree with the prisms.
     """
@@ -171,13 +171,18 @@ class HealthMonitor:
         long = (rows - begin >= repeated) & (np.abs(values) > MIN_LIMITS) & others_move
         for axis in np.flatnonzero(long.any(axis=0)):
             found[:, axis] = np.isin(begin[:, axis], begin[long[:, axis], axis])
-        for sign in (1.0, -1.0):
-            signed = sign * values
-            largest = signed.max(axis=0)
-            at = (signed >= largest - _ROUNDING * np.abs(largest)) & ~stuck
-            count = at.sum(axis=0)
-            near = (signed > largest - LIMIT_STEPS * steps).sum(axis=0) - count
-            found |= at & ((count > repeated) & (count > near) & (largest > MIN_LIMITS) & moves)
+        for axis in np.flatnonzero(moves):
+            changing = values[~stuck[:, 0], axis]
+            ordered = np.sort(changing)
+            ends = np.flatnonzero(np.diff(ordered, append=np.inf) > _ROUNDING * np.abs(ordered))
+            counts = np.diff(ends, prepend=-1)
+            most = int(np.argmax(counts))
+            value, count = ordered[ends[most]], int(counts[most])
+            if count <= repeated[axis] or abs(value) < MIN_LIMITS[axis]:
+                continue
+            near = int(np.count_nonzero(np.abs(changing - value) <= LIMIT_STEPS * steps[axis])) - count
+            if count > 2 * near:
+                found[:, axis] |= np.abs(values[:, axis] - value) <= _ROUNDING * abs(value)
         return found
 
     def innovations(self, time_s: FloatArray, prism: NDArray[np.intp], nis: FloatArray) -> bool:

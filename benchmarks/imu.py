@@ -1,14 +1,15 @@
 """Accuracy of poses with an IMU, post-processed: three, two and one stations, the gyro alone, outages; CPU time.
 
     python benchmarks/run.py imu [--model industrial|consumer] [--scenario dynamic] [--seeds 4] [--first 12]
-        [--duration 600] [--outage SECONDS] [--missions FOLDER]
+        [--duration 600] [--outage SECONDS] [--odometry] [--spin] [--variants N] [--missions FOLDER]
 
 Simulates missions with an IMU whose mounting, latency and gyro matrix are known exactly; the robot is shaken while it drives. Fits
 each recording without the IMU and with it, from the measurements of three, two and one stations, and compares poses 20
 times a second with the truth. Two seconds at either end are left out. Prints rms errors of the robot's origin, of the prisms'
 centroid and of the rotation; mean NEES of the centroid's poses (6 expected) and the share above 22.5 (0.001
 expected); CPU seconds of fit and poses. --outage: all measurements are missing for so long, once a minute; the errors are
-those inside. --missions: keep the missions' recordings in a folder, and use those that it holds.
+those inside. --odometry: with wheel odometry, too; --spin: whose speed is 10 % too high for two seconds of each outage, from a second
+after its start on. --variants: the first so many rows alone. --missions: keep the missions' recordings in a folder, and use those that it holds.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ from tsgt.config import SuperframeMasterConfig
 from tsgt.errors import GeometryError
 from tsgt.estimation.inertial import inertial_samples
 from tsgt.estimation.observations import build_observations, centroid_m
+from tsgt.estimation.odometry import wheel_samples
 from tsgt.geometry import log_so3
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.inertial import fit_inertial_trajectory
 from tsgt.log import configure_logging
 from tsgt.model import MotionPrior
-from tsgt.recording import load_recording, read_imu_samples
+from tsgt.recording import load_recording
 from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
@@ -40,13 +42,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.inertial import InertialSamples, InertialTrajectory
+    from tsgt.geometry.inertial import InertialSamples, InertialTrajectory, WheelSamples
     from tsgt.geometry.trajectory import Observations, Trajectory
-    from tsgt.model import ImuParameters
+    from tsgt.model import ImuParameters, OdometryParameters
 
 POSES_HZ = 20.0
 MARGIN_S = 2.0
 OUTAGE_PERIOD_S = 60.0
+SPIN, SPIN_FROM_S, SPIN_S = 1.1, 1.0, 2.0
 NEES_LIMIT = 22.5  # Exceeded by 1 in 1000 of chi-square with 6 degrees of freedom
 VARIANTS = (
     ("no IMU, 3 stations", 3, None),
@@ -66,22 +69,27 @@ class Mission(NamedTuple):
     samples: InertialSamples
     line_arrival_s: FloatArray  # (N,) of each sample's line
     imu: ImuParameters
+    wheels: WheelSamples
+    wheels_arrival_s: FloatArray  # (N,) of each sample's line
+    odometry: OdometryParameters | None  # None: not to be used
     centroid_m: FloatArray
     time_s: FloatArray  # (N,) epochs
     position_m: FloatArray  # (N, 3) true position of the origin
     rotation: FloatArray  # (N, 3, 3)
 
 
-def simulated(arguments: argparse.Namespace, seed: int, folder: Path) -> Mission:
+def simulated(
+    arguments: argparse.Namespace, seed: int, folder: Path, *, odometry: bool = False, spin: bool = False
+) -> Mission:
     """Simulate a mission, or read the one that the folder holds."""
-    stem = f"{arguments.scenario}-{arguments.model}-{seed}-{arguments.duration:.0f}"
+    stem = f"{arguments.scenario}-{arguments.model}-wheels-{seed}-{arguments.duration:.0f}"
     recording, truth = folder / f"{stem}.jsonl", folder / f"{stem}.npz"
     if not truth.exists():
         scenario = find_scenario(arguments.scenario)
         imu = scenario.imu.model_copy(update={"model": arguments.model})
         # The poses of the mission are not used.
         pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
-        scenario = scenario.model_copy(update={"imu": imu, "pipeline": pipeline})
+        scenario = scenario.model_copy(update={"imu": imu, "pipeline": pipeline, "odometry": True})
         options = SimulationOptions(
             duration_s=arguments.duration, protocol=SuperframeMasterConfig(kind="superframe"), seed=seed
         )
@@ -97,7 +105,7 @@ def simulated(arguments: argparse.Namespace, seed: int, folder: Path) -> Mission
             truth, time_s=time_s, poses=run.true_poses(time_s), start_ns=run.start_ns, gyro_matrix=matrix
         )
     known = np.load(truth)
-    loaded = load_recording(recording)
+    loaded = load_recording(recording, imu=True)
     imu_parameters = loaded.parameters.imu
     if imu_parameters is None:
         raise SystemExit(f"{recording} has no IMU")
@@ -105,16 +113,27 @@ def simulated(arguments: argparse.Namespace, seed: int, folder: Path) -> Mission
     imu_parameters = replace(imu_parameters, gyro_matrix=(first, second, third))
     origin_ns = int(known["start_ns"])
     observations, sources = build_observations(loaded.parameters, loaded.measurements, origin_ns=origin_ns)
-    records = list(read_imu_samples(recording))
+    records = loaded.imu_samples
     samples = inertial_samples(records, imu_parameters, origin_ns)
     arrivals_ns = [record.received_ns for record in records for _ in record.stamp_ns]
     poses = known["poses"]
+    if loaded.parameters.odometry is None:
+        raise SystemExit(f"{recording} has no odometry")
+    wheels = wheel_samples(loaded.odometry, loaded.parameters.odometry, origin_ns)
+    wheels_arrivals_ns = [record.received_ns for record in loaded.odometry for _ in record.stamp_ns]
+    if spin:
+        phase_s = np.mod(wheels.end_s, OUTAGE_PERIOD_S) - 0.5 * OUTAGE_PERIOD_S
+        spinning = (phase_s > SPIN_FROM_S) & (phase_s < SPIN_FROM_S + SPIN_S)
+        wheels = replace(wheels, speed_mps=np.where(spinning, SPIN, 1.0) * wheels.speed_mps)
     return Mission(
         observations,
         np.array([source.received_ns - origin_ns for source in sources]) / 1e9,
         samples,
         (np.array(arrivals_ns)[: len(samples)] - origin_ns) / 1e9,
         imu_parameters,
+        wheels,
+        (np.array(wheels_arrivals_ns)[: len(wheels)] - origin_ns) / 1e9,
+        loaded.parameters.odometry if odometry else None,
         centroid_m(loaded.parameters),
         known["time_s"],
         poses[:, :3, 3],
@@ -132,6 +151,7 @@ def fitted(mission: Mission, observations: Observations, kind: str | None) -> Tr
         mission.imu,
         reference_m=mission.centroid_m,
         gyro_only=MotionPrior() if kind == "gyro" else None,
+        odometry=None if mission.odometry is None else (mission.wheels, mission.odometry),
     ).trajectory
 
 
@@ -191,6 +211,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=12)
     parser.add_argument("--duration", type=float, default=600.0)
     parser.add_argument("--outage", type=float, default=0.0)
+    parser.add_argument("--variants", type=int, default=len(VARIANTS))
+    parser.add_argument("--odometry", action="store_true")
+    parser.add_argument("--spin", action="store_true")
     parser.add_argument("--missions", type=Path)
     arguments = parser.parse_args()
     configure_logging("critical")
@@ -204,9 +227,9 @@ def main() -> None:
         folder = arguments.missions or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         for seed in range(arguments.first, arguments.first + arguments.seeds):
-            mission = simulated(arguments, seed, folder)
+            mission = simulated(arguments, seed, folder, odometry=arguments.odometry, spin=arguments.spin)
             print(f"seed {seed}\n{head}")
-            for name, stations, kind in VARIANTS:
+            for name, stations, kind in VARIANTS[: arguments.variants]:
                 try:
                     found = evaluate(mission, stations, kind, arguments.outage)
                 except GeometryError as error:

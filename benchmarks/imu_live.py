@@ -1,7 +1,7 @@
 """Accuracy of live poses with an IMU, at the time of sending: three, two and one stations, the gyro alone, outages; CPU time.
 
     python benchmarks/run.py imu_live [--model industrial|consumer] [--scenario dynamic] [--seeds 4] [--first 12]
-        [--duration 600] [--outage SECONDS] [--line SAMPLES] [--missions FOLDER]
+        [--duration 600] [--outage SECONDS] [--line SAMPLES] [--odometry] [--spin] [--variants N] [--missions FOLDER]
 
 The missions of the benchmark imu. Measurements and lines of samples reach the smoother when they reached the master; at each
 epoch, 20 times a second, the pose of that epoch is predicted and compared with the truth, from ten seconds after the
@@ -9,7 +9,8 @@ start on. Prints rms errors of the robot's origin, of the prisms' centroid and o
 the share above 22.5 (0.001 expected); the share of epochs with a pose that is not ambiguous; how old the newest sample is; and
 CPU time: of an update (a measurement with all that comes of it), median and 99 % quantile, and of a prediction, median.
 --outage: all measurements are missing for so long, once in a minute (each 20 s up to 3 s); the errors are those inside. --line: samples come
-in lines of so many, 3 ms after the last one of a line, instead of as recorded.
+in lines of so many, 3 ms after the last one of a line, instead of as recorded. --odometry, --spin,
+--variants: as of the benchmark imu.
 """
 
 from __future__ import annotations
@@ -77,15 +78,22 @@ def run(mission: Mission, stations: int, arguments: argparse.Namespace, *, gyro_
         last = np.minimum((np.arange(len(samples)) // arguments.line + 1) * arguments.line, len(samples)) - 1
         sampled_s = samples.end_s[last] + LINE_DELAY_S
     window = InertialFixedLagSmoother(
-        mission.imu, MotionPrior(), reference_m=mission.centroid_m, gyro_only=gyro_only
+        mission.imu,
+        MotionPrior(),
+        reference_m=mission.centroid_m,
+        gyro_only=gyro_only,
+        odometry=mission.odometry,
     )
     states, covariances, epochs, ages, available, update_s, predict_s = [], [], [], [], [], [], []
-    taken = added = 0
+    taken = added = driven = 0
     first_s = np.inf
     for number, now_s in enumerate(mission.time_s):
         stop = int(np.searchsorted(sampled_s, now_s, side="right"))
         window.add_samples(samples.select(slice(added, stop)))
         added = stop
+        stop = int(np.searchsorted(mission.wheels_arrival_s, now_s, side="right"))
+        window.add_odometry(mission.wheels.select(slice(driven, stop)))
+        driven = stop
         until = int(np.searchsorted(arrival_s, now_s, side="right"))
         for row in range(taken, until):
             started_s = time.thread_time()
@@ -147,6 +155,9 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=600.0)
     parser.add_argument("--outage", type=float, default=0.0)
     parser.add_argument("--line", type=int, default=0)
+    parser.add_argument("--variants", type=int, default=len(VARIANTS))
+    parser.add_argument("--odometry", action="store_true")
+    parser.add_argument("--spin", action="store_true")
     parser.add_argument("--missions", type=Path)
     arguments = parser.parse_args()
     configure_logging("critical")
@@ -175,14 +186,15 @@ def main() -> None:
         folder = arguments.missions or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         for seed in range(arguments.first, arguments.first + arguments.seeds):
-            mission = simulated(arguments, seed, folder)
+            mission = simulated(arguments, seed, folder, odometry=arguments.odometry, spin=arguments.spin)
             print(f"seed {seed}\n{head}")
-            for name, stations, gyro_only in VARIANTS:
+            for name, stations, gyro_only in VARIANTS[: arguments.variants]:
                 total[name].append(run(mission, stations, arguments, gyro_only=gyro_only))
                 print(line(name, total[name][-1]), flush=True)
     print(f"all {arguments.seeds} missions, {arguments.scenario}, {arguments.model}\n{head}")
     for name, each in total.items():
-        print(line(name, Live(*(np.concatenate(values) for values in zip(*each, strict=True)))))
+        if each:
+            print(line(name, Live(*(np.concatenate(values) for values in zip(*each, strict=True)))))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@
         [--until 90] [--errors NAME ...] [--missions FOLDER]
 
 The missions of the benchmark imu, replayed as they arrived to a live estimator whose IMU is set up wrongly, as in the
-benchmark imu_setup. Per error: when the IMU is confirmed and when an event names a cause (s after the first measurement); then for
+benchmark imu_setup, or whose station 1 moves 60 s after the first measurement (20 mm, 0.5 mrad; named: the first pose that is
+`contradicted`). Per error: when the IMU is confirmed and when an event names a cause (s after the first measurement); then for
 predicted and for smoothed poses, over the whole drive: the share that is valid, the share of these that rests on the IMU, rms errors of
 the prisms' centroid in mm and of the rotation in degrees, mean NEES, and the share of valid poses whose position or rotation is beyond
 three sigmas (0.0027 expected of each).
@@ -25,7 +26,7 @@ from imu_setup import CONFIGURED, SAMPLED, multiplied
 from tsgt.estimation import LiveEstimator, centroid_at_point
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.log import configure_logging
-from tsgt.model import ImuSamples
+from tsgt.model import ImuSamples, PolarMeasurement
 from tsgt.recording import PoseRecord, load_recording, read_imu_samples
 
 if TYPE_CHECKING:
@@ -35,7 +36,38 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import EventRecord
 
-ERRORS = ("none", *CONFIGURED, *SAMPLED)
+FAULT_NS = 60_000_000_000
+
+
+def turned(measurement: PolarMeasurement) -> PolarMeasurement:
+    """Turn the tripod by 0.5 mrad."""
+    return replace(measurement, horizontal_angle_rad=measurement.horizontal_angle_rad + 5e-4)
+
+
+def tilted(measurement: PolarMeasurement) -> PolarMeasurement:
+    """Tilt the tripod by 0.5 mrad."""
+    lifted_rad = 5e-4 * np.cos(measurement.horizontal_angle_rad)
+    return replace(measurement, zenith_angle_rad=measurement.zenith_angle_rad + float(lifted_rad))
+
+
+def moved(measurement: PolarMeasurement) -> PolarMeasurement:
+    """Move the tripod by 20 mm."""
+    if measurement.slope_distance_m is None:
+        return measurement
+    azimuth, zenith = measurement.horizontal_angle_rad, measurement.zenith_angle_rad
+    direction = [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
+    x, y, z = measurement.slope_distance_m * np.array(direction) - [0.0141, 0.0141, 0.0]
+    distance_m = float(np.sqrt(x * x + y * y + z * z))
+    return replace(
+        measurement,
+        horizontal_angle_rad=float(np.arctan2(y, x) % (2 * np.pi)),
+        zenith_angle_rad=float(np.arccos(z / distance_m)),
+        slope_distance_m=distance_m,
+    )
+
+
+FAULTS = {"tripod turned": turned, "tripod tilted": tilted, "tripod moved": moved}
+ERRORS = ("none", *CONFIGURED, *SAMPLED, *FAULTS)
 THREE_SIGMA_3D = 14.156
 
 
@@ -166,6 +198,15 @@ def main() -> None:
                 if name in CONFIGURED:
                     assert parameters.imu is not None  # noqa: S101 (each mission has one)
                     wrong = replace(parameters, imu=CONFIGURED[name][0](parameters.imu, rng))
+                elif name in FAULTS:
+                    part = [
+                        FAULTS[name](each)
+                        if isinstance(each, PolarMeasurement)
+                        and each.station == 1
+                        and each.stamp_ns > first_ns + FAULT_NS
+                        else each
+                        for each in records
+                    ]
                 elif name in SAMPLED:
                     rates, forces, _ = SAMPLED[name]
                     part = [
@@ -182,6 +223,9 @@ def main() -> None:
                     for event in ("imu_setup_confirmed", "imu_setup_wrong")
                 }
                 confirmed, named = (next(iter(each), "-") for each in times.values())
+                if name in FAULTS:
+                    contradicted = [each.stamp_ns for each in poses if each.reason == "contradicted"]
+                    named = f"{(min(contradicted) - first_ns) / 1e9:.1f}" if contradicted else "-"
                 columns = [
                     figures([each for each in poses if each.series == series], truth)
                     for series in ("predicted", "smoothed")

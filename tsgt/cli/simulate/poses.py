@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import MissionResult
 
 
+PREDICTED_WITH_IMU = "predicted_with_imu"
+
+
 @dataclass(frozen=True, slots=True)
 class EstimatorFigures:
     """Numbers of poses, and the errors of the valid ones against the truth."""
@@ -123,21 +126,26 @@ def _processed_figures(run: MissionResult, recording: Recording) -> EstimatorFig
 
 
 def live_figures(run: MissionResult) -> dict[str, LivePoses]:
-    """Compare the streamed poses with the truth, by series."""
+    """Compare the streamed poses with the truth, by series; of predicted ones also those that rest on the IMU."""
     counts: Counter[str] = Counter()
     for session in run.master_logs:
         counts.update(session.pose_counts)
+        if session.predicted_with_imu:
+            counts[PREDICTED_WITH_IMU] += session.predicted_with_imu
     streamed = [session.valid_poses() for session in run.master_logs]
     found = {}
     for series, count in sorted(counts.items()):
-        some = [poses.select(poses.series == series) for poses in streamed]
+        if series == PREDICTED_WITH_IMU:
+            some = [poses.select((poses.series == "predicted") & poses.with_imu) for poses in streamed]
+        else:
+            some = [poses.select(poses.series == series) for poses in streamed]
         stamp_ns = np.concatenate(
             [
                 poses.stamp_ns + run.start_ns - session.unix_at_zero_ns
                 for session, poses in zip(run.master_logs, some, strict=True)
             ]
         )
-        age_name = "newest_age_s" if series == "predicted" else "sent_age_s"
+        age_name = "newest_age_s" if series.startswith("predicted") else "sent_age_s"
         names = ("position_m", "orientation_xyzw", "covariance", age_name)
         position_m, orientation_xyzw, covariance, age_s = (
             np.concatenate([getattr(poses, name) for poses in some]) for name in names

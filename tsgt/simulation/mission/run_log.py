@@ -58,6 +58,7 @@ class ValidPoses:
     series: NDArray[np.str_]  # (N,) name of the series, as published: kind, with the delay if there is one
     newest_age_s: NDArray[np.float64]  # (N,) age of the newest measurement
     sent_age_s: NDArray[np.float64]  # (N,) age of the pose when it was published
+    with_imu: NDArray[np.bool_]  # (N,) whether it rests on the IMU
     covariance: NDArray[np.float64]  # (N, 6, 6) as published
 
     def select(self, rows: NDArray[np.bool_]) -> ValidPoses:
@@ -96,6 +97,7 @@ class MasterLog:
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
         self.pose_counts: Counter[str] = Counter()  # number of poses, valid or not, by series
+        self.predicted_with_imu = 0  # number of predicted poses, valid or not, that rest on the IMU
         self.frame_count = 0
         self.frames_duration_ns = 0
         self._first_beacon: BeaconRecord | None = None
@@ -106,6 +108,7 @@ class MasterLog:
         self._pose_series = array("b")
         self._pose_numbers = array("d")
         self._pose_sent_ages_s = array("d")
+        self._pose_with_imu = array("b")
 
     def observe(self, record: object, line: bytes) -> None:
         """Log a published record and its line."""
@@ -121,6 +124,7 @@ class MasterLog:
             self.statuses.append(record)
         elif isinstance(record, PoseRecord):
             self.pose_counts[record.series] += 1
+            self.predicted_with_imu += record.kind == "predicted" and record.imu == "used"
             if record.valid:
                 self._observe_pose(record)
         elif isinstance(record, BeaconRecord):
@@ -141,6 +145,7 @@ class MasterLog:
         self._pose_numbers.append(min(ages_s, default=np.nan))
         self._pose_sent_ages_s.append((self._now_ns() + self.unix_at_zero_ns - pose.stamp_ns) / 1e9)
         self._pose_numbers.extend(pose.covariance or ())
+        self._pose_with_imu.append(pose.imu == "used")
         self._pose_series.append(self._series.setdefault(pose.series, len(self._series)))
 
     def valid_poses(self) -> ValidPoses:
@@ -155,6 +160,7 @@ class MasterLog:
             series=np.array([*self._series], dtype=np.str_)[np.array(self._pose_series, dtype=np.intp)],
             newest_age_s=numbers[:, 8],
             sent_age_s=np.array(self._pose_sent_ages_s),
+            with_imu=np.array(self._pose_with_imu, dtype=np.bool_),
             covariance=numbers[:, 9:].reshape(-1, 6, 6),
         )
 

@@ -28,6 +28,7 @@ def test_few_stations_from_mission_to_report(tsgt: Tsgt, tmp_path: Path, station
     live = outcome.json()["live"]
     valid, rms_mm = LIMITS[stations]
     assert live["predicted"]["valid_poses"] > valid * live["predicted"]["poses"]
+    assert 0 < live["predicted_with_imu"]["poses"] <= live["predicted"]["poses"]
     assert live["smoothed"]["centroid"]["position_rms_mm"] < rms_mm
     for arguments in (
         ("process", recording, "--output", tmp_path / "few.csv"),

@@ -1,11 +1,13 @@
 """Tuned noise against the truth, and held-out errors in sigmas.
 
     python benchmarks/run.py noise simulated [SEEDS] [SECONDS]
+    python benchmarks/run.py noise prior [SEEDS]
     python benchmarks/run.py noise held-out RECORDING...
 
 ``simulated``: the robot of the scenario `dynamic`, measured three times 2.5 Hz with white noise as stated, with the time errors
 of the client's fit of the instrument's clock (benchmarks/instrument_time.py) and the time noise that the estimator assumes.
-The truth is the root mean square of the noise that was drawn over what is stated. ``held-out``: by component, moving and
+The truth is the root mean square of the noise that was drawn over what is stated. ``prior``: robots that move as the motion prior
+says, without a stop, for 42 s each; the prior tuned, and given. ``held-out``: by component, moving and
 at rest; near a loss of lock apart.
 """
 
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from harness.prior_motion import draw_motions, measure, sorted_by_time
 from instrument_time import Case, errors
 from measuring import normalised_squared
 
@@ -26,6 +29,7 @@ from tsgt.estimation import build_observations, instrument_time_sigma_s
 from tsgt.geometry import cartesian_to_polar, invert, log_so3, polar_to_cartesian, transform_points
 from tsgt.geometry.batch import TrajectoryFit, fit_trajectory, tune
 from tsgt.geometry.trajectory import Observations
+from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
 from tsgt.simulation.world import World, scenario_world
 
@@ -122,6 +126,24 @@ def simulated(seeds: int, duration_s: float) -> None:
     print(f"found / true: {np.mean(ratios):.3f} on average")
 
 
+def of_prior(seeds: int) -> None:
+    """Print the noise found where the truth is 1, by seed, and the means."""
+    prior, found = MotionPrior(), []
+    print("| seed | prior tuned | prior given |")
+    print("|---|---|---|")
+    for seed in range(1, seeds + 1):
+        (motion,) = draw_motions(prior, count=1, duration_s=43.0, seed=seed)
+        observations = sorted_by_time(measure(motion, until_s=42.0, seed=seed))
+        scales = [
+            tune(observations).noise_scale,
+            tune(observations, start=prior, noise_only=True).noise_scale,
+        ]
+        found.append(scales)
+        print(f"| {seed} | {scales[0]:.3f} | {scales[1]:.3f} |", flush=True)
+    tuned, given = np.mean(found, axis=0)
+    print(f"on average {tuned:.3f} and {given:.3f}, standard deviations {np.std(found, axis=0).round(3)}")
+
+
 def held_out(path: Path) -> None:
     """Print held-out errors in sigmas by station and component."""
     recording = load_recording(path)
@@ -163,6 +185,8 @@ def main() -> None:
     if sys.argv[1:2] == ["held-out"]:
         for path in sys.argv[2:]:
             held_out(Path(path))
+    elif sys.argv[1:2] == ["prior"]:
+        of_prior(int((*sys.argv[2:3], "8")[0]))
     else:
         seeds, duration_s = (
             float(each) for each in [*sys.argv[2:4], *("6", "300")[max(len(sys.argv) - 2, 0) :]]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 )
 @json_option
 def import_odometry(*, files: tuple[Path, ...], offset_ms: float, output: Path, as_json: bool) -> None:
-    """Import wheel odometry that another program recorded, for use with an IMU.
+    """Import wheel odometry that another program recorded.
 
     The columns of the CSV FILES are stamp_ns or time_s (Unix time of the end of a sample's interval), speed_mps (forwards, mean over
     the interval) and, optionally, yaw_rate_radps.

@@ -99,21 +99,21 @@ def imu_options(command: Callable[..., R]) -> Callable[..., R]:
     )
     @click.option(
         "--wheel-odometry",
-        "odometry",
+        "wheels",
         type=path_type,
         help="Wheel odometry (tsgt import odometry) that is used with the IMU, instead of recorded one.",
     )
     @functools.wraps(command)
     def with_options(
-        *, left_out: bool, samples: Path | None, setup: Path | None, odometry: Path | None, **others: Any
+        *, left_out: bool, samples: Path | None, setup: Path | None, wheels: Path | None, **others: Any
     ) -> R:
         if left_out and (samples is not None or setup is not None):
             raise click.UsageError(f"--no-imu and --imu{'' if samples else '-setup'} exclude each other")
-        if left_out and odometry is not None:
+        if left_out and wheels is not None:
             raise click.UsageError(
                 "--no-imu and --wheel-odometry exclude each other: wheels are used with an IMU"
             )
-        options = ImuOptions(left_out=left_out, samples=samples, setup=setup, odometry=odometry)
+        options = ImuOptions(left_out=left_out, samples=samples, setup=setup, odometry=wheels)
         return command(imu=options, **others)
 
     return with_options

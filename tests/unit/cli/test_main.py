@@ -53,6 +53,18 @@ def test_summary_is_the_first_sentence_of_the_help(name: str) -> None:
     assert (command.help or "").partition("\n")[0] == COMMANDS[name][1]
 
 
+@pytest.mark.parametrize("group", list(groups()), ids=lambda each: each[0])
+def test_each_option_has_a_name_of_its_own(group: tuple[str, click.Group]) -> None:
+    """Two options of one name would overwrite each other, as where a command adds options that others share."""
+    _, parent = group
+    context = click.Context(parent, **HELP_OPTIONS)
+    for name in parent.list_commands(context):
+        command = parent.get_command(context, name)
+        assert command is not None
+        names = [parameter.name for parameter in command.params]
+        assert len(set(names)) == len(names), name
+
+
 def test_help_imports_no_command() -> None:
     """It starts fast on a small computer."""
     program = "from tsgt.cli.main import cli; import sys; cli(['--help'], standalone_mode=False)"

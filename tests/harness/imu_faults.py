@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MAX_NEES, TOLERANCE = 60.0, 0.02
 """Limits of the invariant of poses: in m at the prisms' centroid and rad."""
 
-_PERIOD_NS = 100_000_000
+_PERIOD_NS = 100_000_000  # Of poses
 
 
 def confirm_once() -> StartCheck:
@@ -106,13 +106,19 @@ class Drive:
         return found
 
     def poses(
-        self, samples: Sequence[ImuSamples], *, stations: int = 3, start_check: StartCheck | None = None
+        self,
+        samples: Sequence[ImuSamples],
+        *,
+        stations: int = 3,
+        start_check: StartCheck | None = None,
+        period_ns: int = _PERIOD_NS,
     ) -> Poses:
         """Return the poses of a live estimator; without samples it has no IMU."""
         parameters = replace(
             self.parameters,
             stations=self.parameters.stations[:stations],
             prisms=self.parameters.prisms[:stations],
+            pipeline=replace(self.parameters.pipeline, period_ns=period_ns),
         )
         if not samples:
             parameters = replace(parameters, imu=None)
@@ -147,6 +153,9 @@ class Drive:
         apart = transform_points(found, centroid_m) - transform_points(truth, centroid_m)
         lengths[valid, 0] = np.linalg.norm(apart, axis=1)
         lengths[valid, 1] = np.linalg.norm(turn, axis=1)
+        sigmas = np.full((len(records), 2), np.nan)
+        for column, block in enumerate((slice(0, 3), slice(3, 6))):
+            sigmas[valid, column] = np.sqrt(np.linalg.eigvalsh(covariance[:, block, block])[:, -1])
         lengths[valid, 2] = np.einsum("ni,ni->n", error, solved)
         return Poses(
             time_s,
@@ -156,7 +165,8 @@ class Drive:
             lengths[:, 0],
             lengths[:, 1],
             lengths[:, 2],
-            np.array([np.nan if each.jump_m is None else each.jump_m for each in records]),
+            np.array([[each.jump_m, each.jump_rad] for each in records], dtype=np.float64),
+            sigmas,
         )
 
 
@@ -171,7 +181,8 @@ class Poses:
     position_m: FloatArray  # Errors at the prisms' centroid
     rotation_rad: FloatArray
     nees: FloatArray
-    jump_m: FloatArray
+    jumps: FloatArray  # (N, 2) in m and rad; NaN where none is stated
+    sigmas: FloatArray  # (N, 2) of the position in m and the rotation in rad, in the least certain direction
 
     def select(self, rows: NDArray[np.bool_]) -> Poses:
         """Return some."""

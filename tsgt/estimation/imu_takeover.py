@@ -16,6 +16,7 @@ import numpy as np
 from tsgt.estimation.inertial import SampleConverter
 from tsgt.estimation.odometry import WheelConverter
 from tsgt.estimation.pose_batch import ImuUse
+from tsgt.geometry.inertial import DISAGREES_WITH_PRISMS
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
@@ -186,8 +187,6 @@ class ImuState(NamedTuple):
     accelerometer_bias_mps2: Vector3 | None
 
 
-_BY_PRISMS = "disagrees with the prisms"  # What the health of a trajectory says of innovations
-
 _WRONG = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
 
 
@@ -337,7 +336,7 @@ class ImuTakeover:
 
         A wrong one among right ones is an outlier, which is not followed.
         """
-        rejected = found == ImuUse.DISAGREES and _BY_PRISMS in self._contradiction
+        rejected = found == ImuUse.DISAGREES and DISAGREES_WITH_PRISMS in self._contradiction
         followed = False
         if self._with.ambiguous:
             self._ambiguous_from_s = min(self._ambiguous_from_s, self._with.ambiguous_from_s)

@@ -37,7 +37,7 @@ FULL_DISK_BYTES = 50_000_000
 ALARMS = frozenset(
     {
         "station_lost", "radio_failed", "geofence_exited", "layout_residual_high", "imu_setup_wrong", "imu_lost",
-        "beacon_time_rejected", "link_delay_anomaly", "unauthenticated",
+        "beacon_time_rejected", "link_delay_anomaly", "unauthenticated", "station_contradicted",
     }
 )  # fmt: skip
 """Events that need the operator; those of ``_END`` end them."""
@@ -110,6 +110,8 @@ def explanation(pose: PoseRecord, limits: ValidityLimits | None, conditions: Map
             return "the prisms seen give no rotation: too close to a line"
         case "tilt":
             return "the robot would lean too far: prisms swapped or layout mirrored?"
+        case "contradicted":
+            return "the IMU contradicted the only station: tripod or prism moved? Check them, then restart the master"
     return "the pose is invalid"
 
 
@@ -132,6 +134,7 @@ def degradations(
         "prism_missing": _missing(pose, conditions) or "a prism is not measured",
         "old_measurements": "the pose rests on old measurements",
         "ambiguous": "measurements contradict each other",
+        "imu_unconfirmed": "the set-up of the IMU is not confirmed yet: drive, with turns",
         "residual": "the prisms nearly miss their layout: tripod or prism moved?",
         "uncertain": _uncertain(smoothed or pose, limits),
     }

@@ -6,7 +6,7 @@ docs/explanation/imu.md derives the equations.
 
 from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
 from tsgt.geometry.inertial.fixed_lag import InertialFixedLagSmoother, WindowTrajectory
-from tsgt.geometry.inertial.health import sound_samples
+from tsgt.geometry.inertial.health import DISAGREES_WITH_PRISMS, sound_samples
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
@@ -35,6 +35,7 @@ from tsgt.geometry.inertial.states import (
 )
 
 __all__ = [
+    "DISAGREES_WITH_PRISMS",
     "INERTIAL_STATE_DIM",
     "MAX_KNOT_SPACING_S",
     "ContiguousSamples",

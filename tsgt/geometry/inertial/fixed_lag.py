@@ -367,6 +367,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._next_search_s = -np.inf
             self._reliable_from_s = _measured_twice_s(observations.select(~outliers))
         else:
+            # Samples from before the IMU was sound again contradict the measurements: the next search does without the older half.
+            middle_s = 0.5 * (searched.time_s[0] + searched.time_s[-1])
+            self._searched = searched.select(searched.time_s >= middle_s)
+            self._horizon_s = max(self._horizon_s, float(middle_s))
+            self._select(observations.time_s >= middle_s)
             raise GeometryError("the measurements do not determine the trajectory")
 
     def _search(self, observations: Observations) -> InertialSolution:

@@ -43,6 +43,8 @@ BLOW_MPS2 = 50.0
 INCONSISTENT_NIS = 25.0
 """NIS (3 degrees of freedom) of a measurement that disagrees with the samples; 1.5 in 100 000 consistent ones exceed it."""
 DISAGREEMENT_S = 1.2  # Within which two prisms must disagree: each is measured two or three times in it
+DISAGREES_WITH_PRISMS = "it disagrees with the prisms"
+"""Reason of a disagreement that innovations show."""
 ALONE = 3  # Successive measurements of one prism that disagree, where none other is measured: it cannot be told from the IMU
 
 _ROUNDING = 1e-9  # Of the product with the gyro matrix, relative
@@ -198,7 +200,7 @@ class HealthMonitor:
         if len(inconsistent) < 2 and not alone:
             return False
         self.setup_in_doubt = True
-        self._report("it disagrees with the prisms", max(self._now_s, float(time_s[-1])))
+        self._report(DISAGREES_WITH_PRISMS, max(self._now_s, float(time_s[-1])))
         self._innovations.clear()
         return True
 

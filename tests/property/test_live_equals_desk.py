@@ -22,7 +22,7 @@ from tsgt.master.replay import replayed
 from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.model import Status
-from tsgt.recording import encode_line
+from tsgt.recording import SetupRecord, encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -223,6 +223,7 @@ def _replayed_again(
         *((at_ns, partial(publisher.put, replace(record, stamp_ns=at_ns))) for at_ns, record in others),
         *((at_ns, partial(publisher.advance, at_ns)) for at_ns in ticks_ns),
     ]
+    publisher.put(SetupRecord.of(scene.parameters, START))
     for _, call in sorted(calls, key=lambda each: each[0]):
         call()
     with TemporaryDirectory() as folder:

@@ -34,7 +34,7 @@ from tsgt.recording import (
 from tsgt.simulation.lora import LinkModel
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
+    from collections.abc import AsyncGenerator, Callable
     from pathlib import Path
 
     from harness.field import Field
@@ -227,14 +227,15 @@ async def test_hanging_disk_does_not_delay_frames(tmp_path: Path) -> None:
     assert undelivered(field, until_s=28) == NOTHING
 
 
-async def _in_a_thread_of_its_own(function: object) -> None:
+async def _in_a_thread_of_its_own(function: Callable[..., object], *arguments: object) -> object:
     """Run a function in a thread while virtual time goes on."""
-    assert callable(function)
-    thread = threading.Thread(target=function)
+    results: list[object] = []
+    thread = threading.Thread(target=lambda: results.append(function(*arguments)))
     thread.start()
     while thread.is_alive():
         await asyncio.sleep(0.001)
         thread.join(0.0005)
+    return results[0]
 
 
 # --- Radio and stations -----------------------------------------------------------------------------------------------

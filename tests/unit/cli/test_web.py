@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from click.testing import CliRunner, Result
+from harness.cli import called
 
-from tsgt.cli.web import web
 from tsgt.errors import ConfigError
 from tsgt.web.code_file import read_code
 
@@ -15,18 +14,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def invoke(*arguments: str) -> Result:
-    """Run the command; none of these tests gets as far as serving."""
-    return CliRunner().invoke(web, arguments)
-
-
 @pytest.mark.parametrize("address", ["0.0.0.0", "192.168.4.1", "::", "fe80::1%wlan0"])  # noqa: S104 (that is the point)
 def test_address_without_a_code_is_refused(address: str) -> None:
     """Other computers get in with an access code only; the message says how to make one."""
-    result = invoke("--listen", address)
-    assert result.exit_code == 2
-    assert "--code-file" in result.output
-    assert "/dev/urandom" in result.output
+    outcome = called("web", "--listen", address)
+    assert outcome.code == 2
+    assert "--code-file" in outcome.err
+    assert "/dev/urandom" in outcome.err
 
 
 @pytest.mark.parametrize(
@@ -39,9 +33,9 @@ def test_address_without_a_code_is_refused(address: str) -> None:
 )
 def test_impossible_options_are_refused(arguments: tuple[str, ...], word: str) -> None:
     """With what to do instead."""
-    result = invoke(*arguments)
-    assert result.exit_code == 2
-    assert word in result.output
+    outcome = called("web", *arguments)
+    assert outcome.code == 2
+    assert word in outcome.err
 
 
 @pytest.mark.parametrize("content", [b"short", b"", b"two\nlines of it", b"\xff" * 12 + b"\x00", b"x" * 300])

@@ -131,6 +131,7 @@ def live(parameters: Parameters, kind: Kind) -> PoseBatch:
     return poses.select((poses.kind == kind) & (poses.stamp_ns > START + 5_000_000_000))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Kind.SMOOTHED, Kind.PREDICTED])
 def test_common_part_of_live_poses(kind: Kind) -> None:
     """Live, a station that is off displaces poses by what the common covariance says."""

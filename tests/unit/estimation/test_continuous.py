@@ -386,6 +386,7 @@ def test_collinear_layout_is_rejected(scene: Scene) -> None:
         ContinuousEstimator(replace(scene.parameters, prisms=line))
 
 
+@pytest.mark.slow
 def test_memory_is_bounded(scene: Scene) -> None:
     """After a minute it holds no more than after ten seconds."""
     estimator = ContinuousEstimator(scene.parameters)

@@ -93,6 +93,7 @@ async def test_poses_are_correct(tmp_path: Path, *, authors: bool, rate_hz: floa
     assert events(field) == []
 
 
+@pytest.mark.slow
 async def test_repeated_measurement_is_published_once(tmp_path: Path) -> None:
     """Polls are more frequent than measurements when only one station responds."""
     async with field_of(tmp_path) as field:

@@ -229,6 +229,7 @@ def test_layout_without_a_tracked_prism_is_rejected(tsgt: Tsgt, tmp_path: Path) 
     assert f"{path}: prisms.3: missing; a station tracks it" in outcome.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", FIGURES)
 @pytest.mark.parametrize("study", ["perturbation", "layout"])
 def test_figures_are_drawn(tsgt: Tsgt, tmp_path: Path, study: str, ending: str) -> None:

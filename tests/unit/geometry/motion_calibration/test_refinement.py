@@ -92,6 +92,7 @@ def test_latency_is_found() -> None:
     assert found.setup.latencies_s[1] == pytest.approx(0.025, abs=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prisms", [False, True])
 def test_prisms_are_refined_only_on_request(prisms: bool) -> None:  # noqa: FBT001
     """A prism that is 12 mm off is named in any case; the layout changes only if asked."""

@@ -133,6 +133,7 @@ def test_index_error_and_far_targets_are_told_apart() -> None:
     assert any(cause.error is INDEX and cause.station == 1 for cause in solved.causes)
 
 
+@pytest.mark.slow
 def test_noise_larger_than_stated_scales_the_sigmas() -> None:
     """Twice the noise is no cause of its own."""
     solved = calibrated(noise=2.0, targets=14)

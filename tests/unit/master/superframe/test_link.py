@@ -488,6 +488,7 @@ async def test_measurements_from_before_1970_are_kept(tmp_path: Path) -> None:
         assert abs(true_ns) <= m.stamp_bound_ns
 
 
+@pytest.mark.slow
 async def test_replay_equals_the_stream(tmp_path: Path) -> None:
     """Beacons and late measurements included."""
     link = LinkModel(loss_probability=0.2)

@@ -48,6 +48,7 @@ async def test_every_offered_distance_is_read_once(rate_hz: float) -> None:
         assert reading.slope_distance_m == pytest.approx(source.distance_m, abs=1e-9)
 
 
+@pytest.mark.slow
 async def test_fast_instrument_is_polled_fast_enough() -> None:
     """At 20 Hz with short replies nearly every distance is read."""
     model = InstrumentModelConfig(processing_min_ms=5.0, processing_max_ms=10.0)

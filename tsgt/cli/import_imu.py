@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-import tsgt
+from tsgt.cli.imported_samples import write_samples
 from tsgt.cli.options import RECORDING_SUFFIXES, FiniteRange, OutputFile, json_option, path_type
 from tsgt.cli.output import print_json, refuse_overwrite
-from tsgt.clock import SystemClock
-from tsgt.recording import RecordingHeader, encode_line, write_atomically
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,21 +47,7 @@ def import_imu(
         {each.stamp_ns: each for path in files for each in read_imu_file(path, topic)}.values(),
         key=lambda sample: sample.stamp_ns,
     )
-    header = RecordingHeader(
-        software=f"tsgt {tsgt.__version__}",
-        created_ns=SystemClock().realtime_ns(),
-        source=f"import imu: {' '.join(path.name for path in files)}",
-    )
-    gaps, expected = 0, 0
-    try:
-        with write_atomically(output) as file:
-            file.write(encode_line(header) + b"\n")
-            for record in imu_records(samples, round(offset_ms * 1e6)):
-                gaps += record.sequence > expected
-                expected = record.sequence + len(record.stamp_ns)
-                file.write(encode_line(record) + b"\n")
-    except ValueError as error:
-        raise click.UsageError(f"--offset-ms: {error}") from error
+    gaps = write_samples(output, "imu", files, imu_records(samples, round(offset_ms * 1e6)))
     rate_hz = 1e9 / interval_ns(samples)
     if as_json:
         print_json({"samples": len(samples), "rate_hz": rate_hz, "gaps": gaps})

@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-import tsgt
+from tsgt.cli.imported_samples import write_samples
 from tsgt.cli.options import RECORDING_SUFFIXES, FiniteRange, OutputFile, json_option, path_type
 from tsgt.cli.output import print_json, refuse_overwrite
-from tsgt.clock import SystemClock
-from tsgt.recording import RecordingHeader, encode_line, write_atomically
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -42,21 +40,7 @@ def import_odometry(*, files: tuple[Path, ...], offset_ms: float, output: Path, 
 
     refuse_overwrite(files, output)
     samples = read_wheel_files(files)
-    header = RecordingHeader(
-        software=f"tsgt {tsgt.__version__}",
-        created_ns=SystemClock().realtime_ns(),
-        source=f"import odometry: {' '.join(path.name for path in files)}",
-    )
-    gaps, expected = 0, 0
-    try:
-        with write_atomically(output) as file:
-            file.write(encode_line(header) + b"\n")
-            for record in wheel_records(samples, round(offset_ms * 1e6)):
-                gaps += record.sequence > expected
-                expected = record.sequence + len(record.stamp_ns)
-                file.write(encode_line(record) + b"\n")
-    except ValueError as error:
-        raise click.UsageError(f"--offset-ms: {error}") from error
+    gaps = write_samples(output, "odometry", files, wheel_records(samples, round(offset_ms * 1e6)))
     duration_s = (samples[-1].stamp_ns - samples[0].stamp_ns) / 1e9
     if as_json:
         print_json({"samples": len(samples), "duration_s": duration_s, "gaps": gaps})

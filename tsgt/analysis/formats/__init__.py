@@ -6,12 +6,13 @@ was expected and what was found.
 """
 
 from tsgt.analysis.formats.export import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
-from tsgt.analysis.formats.imu_files import FileSample, imu_records, interval_ns, read_imu_file
+from tsgt.analysis.formats.imu_files import FileSample, imu_records, read_imu_file
 from tsgt.analysis.formats.mcap import messages, write_mcap
 from tsgt.analysis.formats.odometry import read_stationary_intervals
 from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, tracked_prisms
 from tsgt.analysis.formats.rtklib import QUALITIES, SECOND_NS, PosFile, TimeSystem, read_pos
 from tsgt.analysis.formats.rts_files import PublishedTrack, read_prisms, read_tracks
+from tsgt.analysis.formats.sample_runs import interval_ns
 from tsgt.analysis.formats.setup_files import (
     InstrumentErrors,
     write_imu_mounting,

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.analysis.formats.csv_table import read_table
+from tsgt.analysis.formats.sample_runs import MIN_SAMPLES, SampleRun, sample_runs
 from tsgt.errors import InputFileError, MissingExtraError
 from tsgt.model import ImuSamples
 
@@ -17,11 +16,6 @@ if TYPE_CHECKING:
     from tsgt.model import Vector3
 
 TABLE_SUFFIX = ".csv"
-
-GAP = 1.5  # median intervals; a longer one lacks samples
-
-_SAMPLES_PER_RECORD = 10
-_MIN_SAMPLES = 2
 
 _TIME = ("stamp_ns", "time_s")
 _RATE = tuple(f"angular_rate_{axis}_radps" for axis in "xyz")
@@ -45,47 +39,26 @@ def read_imu_file(path: Path, topic: str | None = None) -> list[FileSample]:
     """
     samples = list(_table(path) if path.suffix == TABLE_SUFFIX else _bag(path, topic))
     unique = {sample.stamp_ns: sample for sample in samples}
-    if len(unique) < _MIN_SAMPLES:
+    if len(unique) < MIN_SAMPLES:
         raise InputFileError("contains fewer than two samples of an IMU", path=path)
     return [unique[stamp_ns] for stamp_ns in sorted(unique)]
 
 
-def interval_ns(samples: Sequence[FileSample]) -> int:
-    """Return the median interval between samples."""
-    return max(1, round(median(b.stamp_ns - a.stamp_ns for a, b in pairwise(samples))))
-
-
 def imu_records(samples: Sequence[FileSample], offset_ns: int) -> Iterator[ImuSamples]:
     """Yield records without gaps in them; ``offset_ns`` is added to all times. The sequence counts missing samples."""
-    period_ns = interval_ns(samples)
-    sequence = 0
-    run: list[tuple[FileSample, int]] = []
-    last_ns: int | None = None
-    for sample in samples:
-        since_ns = period_ns if last_ns is None else sample.stamp_ns - last_ns
-        last_ns = sample.stamp_ns
-        gap = since_ns > GAP * period_ns
-        if run and (gap or len(run) == _SAMPLES_PER_RECORD):
-            yield _record(sequence, run, offset_ns)
-            sequence += len(run)
-            run = []
-        if gap:
-            sequence += max(round(since_ns / period_ns) - 1, 1)
-        run.append((sample, period_ns if gap else since_ns))
-    if run:
-        yield _record(sequence, run, offset_ns)
+    return (_record(run, offset_ns) for run in sample_runs(samples))
 
 
-def _record(sequence: int, run: list[tuple[FileSample, int]], offset_ns: int) -> ImuSamples:
-    stamps = tuple(sample.stamp_ns + offset_ns for sample, _ in run)
+def _record(run: SampleRun[FileSample], offset_ns: int) -> ImuSamples:
+    stamps = tuple(sample.stamp_ns + offset_ns for sample in run.samples)
     return ImuSamples(
-        sequence=sequence,
+        sequence=run.sequence,
         received_ns=stamps[-1],
         stamp_ns=stamps,
-        duration_ns=tuple(duration_ns for _, duration_ns in run),
-        instrument_time_ns=tuple(sample.stamp_ns for sample, _ in run),
-        angular_rate_radps=tuple(sample.angular_rate_radps for sample, _ in run),
-        specific_force_mps2=tuple(sample.specific_force_mps2 for sample, _ in run),
+        duration_ns=run.duration_ns,
+        instrument_time_ns=tuple(sample.stamp_ns for sample in run.samples),
+        angular_rate_radps=tuple(sample.angular_rate_radps for sample in run.samples),
+        specific_force_mps2=tuple(sample.specific_force_mps2 for sample in run.samples),
     )
 
 

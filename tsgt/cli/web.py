@@ -72,7 +72,7 @@ def web(
     if key is not None and certificate is None:
         raise click.UsageError("--key belongs to a --certificate; give both")
     listen = _address(address)
-    require_extra("the operator's page does", "aiohttp", extra="web")
+    require_extra("pages for browsers", "aiohttp", extra="web")
     # Imported here: `--help` needs none of it.
     from tsgt import service
     from tsgt.clock import SystemClock

@@ -29,7 +29,8 @@ LARGEST_RSS_KB = 80_000
 def relay(folder: Path) -> Iterator[tuple[int, int]]:
     """Run a relay on all loopback addresses; gives its process id and port."""
     write_key(folder / "relay.key")
-    with socket.create_server((READER, 0)) as probe:
+    # A closed connection that a stranger bound to this port at another address would keep the relay out.
+    with socket.create_server(("0.0.0.0", 0)) as probe:  # noqa: S104 (as the relay does)
         port: int = probe.getsockname()[1]
     command = [
         sys.executable, "-m", "tsgt", "relay", "--socket", str(folder / "s"), "--key", str(folder / "relay.key"),
@@ -42,6 +43,7 @@ def relay(folder: Path) -> Iterator[tuple[int, int]]:
     ):
         deadline = time.monotonic() + 20
         while "relay_source_connected" not in (folder / "relay.log").read_text():
+            assert process.poll() is None, (folder / "relay.log").read_text()
             assert time.monotonic() < deadline
             time.sleep(0.05)
         yield process.pid, port

@@ -1,0 +1,19 @@
+"""Somebody's estimate against the reference: what stands between them is fitted jointly, then the errors are stated.
+
+Comes in: reference poses with covariance, estimates of other programs (poses or positions, on their own clock, in their own frame,
+of their own point on the robot). Goes out: time offset, extrinsic and frame with uncertainties, and error statistics.
+"""
+
+from tsgt.analysis.compare.pairing import PairedPoses
+from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation
+from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
+
+__all__ = [
+    "Alignment",
+    "Estimate",
+    "Fit",
+    "FittedPart",
+    "PairedPoses",
+    "ReferencePoses",
+    "Relation",
+]

@@ -1,0 +1,46 @@
+"""What stands between an estimate and the reference: clock, frame, scale and the point on the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from tsgt.geometry import FloatArray
+
+FittedPart = Literal["offset", "skew", "extrinsic", "frame", "scale"]
+Alignment = Literal["none", "start", "yaw", "rigid"]
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """Takes an estimate's pose E at its stamp τ to the pose ``T_station1_frame · scale(E)`` of the sensor.
+
+    The reference has the same sensor at ``T_station1_point(t) · T_point_sensor``, with ``t = τ + offset_s + skew (τ - τ_0)``,
+    where τ_0 is the estimate's first stamp. ``scale`` multiplies the positions of the estimate.
+    """
+
+    offset_s: float
+    skew: float
+    T_point_sensor: FloatArray  # (4, 4) extrinsic
+    T_station1_frame: FloatArray  # (4, 4)
+    scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A fitted relation.
+
+    ``names`` of the P fitted unknowns: offset_s, skew, scale; extrinsic_{x,y,z}_m and _{roll,pitch,yaw}_rad (translation of the sensor in
+    the axes of the reference's point; small rotation about these axes); frame_{x,y,z}_m and _{roll,pitch,yaw}_rad (about the axes of
+    ``station1``, at the centroid of the estimate's positions).
+    """
+
+    relation: Relation
+    names: tuple[str, ...]
+    covariance: FloatArray  # (P, P) with the estimate's correlated errors allowed for
+    undetermined: tuple[str, ...]  # Of the names: what the motion does not determine; left at its prior
+    used: NDArray[np.bool_]  # (M,) poses of the estimate that were used: paired, and not outliers of the fit

@@ -1,0 +1,119 @@
+"""Simulated estimates of other programs: the truth that they state, and the size of their errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tsgt.config import ScenarioConfig
+from tsgt.geometry import invert, rotation_from_quaternion, transform_from
+from tsgt.simulation.estimates import (
+    GNSS,
+    LIDAR,
+    VISUAL_INERTIAL,
+    EstimateModel,
+    Jump,
+    SimulatedEstimate,
+    draw_relation,
+    simulate_estimate,
+)
+from tsgt.simulation.world import World, scenario_world
+
+UNTIL_S = 300.0
+EXACT = EstimateModel(rate_hz=20.0)
+
+
+@cache
+def _world() -> World:
+    return scenario_world(ScenarioConfig(), UNTIL_S, np.random.default_rng(2))
+
+
+def _simulated(model: EstimateModel, seed: int = 1, *, scale: float = 1.0) -> SimulatedEstimate:
+    rng = np.random.default_rng(seed)
+    relation = draw_relation(model, rng, scale=scale)
+    return simulate_estimate(model, relation, _world().pose_at, UNTIL_S, rng, start_ns=10**18)
+
+
+def test_true_relation_takes_an_exact_estimate_to_the_truth() -> None:
+    """Offset, skew, frame, scale and extrinsic, by their definition, explain everything."""
+    rng = np.random.default_rng(3)
+    truth = replace(draw_relation(EXACT, rng, scale=2.5), skew=1e-4)
+    found = simulate_estimate(EXACT, truth, _world().pose_at, UNTIL_S, rng, start_ns=10**18)
+    assert found.orientation_xyzw is not None
+    stamp_s = (found.stamp_ns - 10**18) / 1e9
+    time_s = stamp_s + truth.offset_s + truth.skew * (stamp_s - stamp_s[0])
+    in_frame = transform_from(
+        rotation_from_quaternion(found.orientation_xyzw), truth.scale * found.position_m
+    )
+    expected = _world().pose_at(time_s) @ truth.T_robot_sensor
+    np.testing.assert_allclose(truth.T_station1_frame @ in_frame, expected, atol=1e-6)
+    np.testing.assert_allclose(found.T_station1_sensor, expected, atol=1e-6)
+    assert found.ate_position_m("rigid") == pytest.approx(0.0, abs=1e-9)
+    assert found.ate_rotation_rad("yaw") == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("model", "low_percent", "high_percent"), [(LIDAR, 0.1, 0.5), (VISUAL_INERTIAL, 0.2, 0.8)]
+)
+def test_drift_is_typical(model: EstimateModel, low_percent: float, high_percent: float) -> None:
+    """Translation error over segments of 100 m, as KITTI defines it, in per cent; the path is curved, which drift of the yaw forgives."""
+    percent = []
+    for seed in range(6):
+        found = _simulated(model, seed)
+        true, estimated = found.T_station1_sensor, found.T_station1_estimated
+        driven_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))]
+        starts = np.flatnonzero(driven_m + 100.0 < driven_m[-1])[::50]
+        ends = np.searchsorted(driven_m, driven_m[starts] + 100.0)
+        error = invert(invert(true[starts]) @ true[ends]) @ (invert(estimated[starts]) @ estimated[ends])
+        percent.append(np.linalg.norm(error[:, :3, 3], axis=1).mean())
+    assert low_percent < np.mean(percent) < high_percent
+
+
+def test_gravity_keeps_the_tilt() -> None:
+    """A visual-inertial estimate drifts in yaw; its frame is level, and its tilt stays within a degree."""
+    found = _simulated(VISUAL_INERTIAL)
+    np.testing.assert_allclose(found.truth.T_station1_frame[2], [0, 0, 1, found.truth.T_station1_frame[2, 3]])
+    down, true_down = found.T_station1_estimated[:, 2, :3], found.T_station1_sensor[:, 2, :3]
+    assert np.abs(np.degrees(np.arccos(np.clip((down * true_down).sum(axis=1), -1, 1)))).max() < 1.0
+
+
+def test_visual_inertial_has_jitter_and_dropouts() -> None:
+    """Intervals scatter by the jitter of two stamps; some poses lack."""
+    found = _simulated(VISUAL_INERTIAL)
+    assert found.truth.scale == 1.0
+    intervals_s = np.diff(found.stamp_ns) / 1e9
+    assert (intervals_s > 0).all()
+    assert intervals_s[intervals_s < 0.09].std() == pytest.approx(np.sqrt(2) * 1e-3, rel=0.1)
+    assert 0.90 * UNTIL_S * 20 < len(found.stamp_ns) < 0.999 * UNTIL_S * 20
+
+
+def test_gnss_errors() -> None:
+    """Positions alone; errors of 10 mm horizontal and 20 mm vertical that last for a minute."""
+    errors = np.concatenate([_errors_m(_simulated(GNSS, seed)) for seed in range(40)])
+    np.testing.assert_allclose(errors.std(axis=0), [0.0104, 0.0104, 0.0202], rtol=0.15)
+    found = _simulated(GNSS)
+    assert found.orientation_xyzw is None
+    assert np.diff(_errors_m(found), axis=0).std() < 0.5 * _errors_m(found).std()
+
+
+def _errors_m(found: SimulatedEstimate) -> np.ndarray:
+    return found.T_station1_estimated[:, :3, 3] - found.T_station1_sensor[:, :3, 3]
+
+
+def test_divergence_and_jump() -> None:
+    """The position runs away from the stated time on; a jump remains."""
+    jump = Jump(time_s=100.0, position_m=(0.0, 0.0, 1.0))
+    errors = _errors_m(_simulated(replace(EXACT, diverges_at_s=200.0, jumps=(jump,))))
+    np.testing.assert_allclose(errors[: 20 * 99], 0.0, atol=1e-9)
+    np.testing.assert_allclose(errors[20 * 101 : 20 * 199], [[0, 0, 1]] * (98 * 20), atol=1e-9)
+    assert np.linalg.norm(errors[-1, :2]) == pytest.approx(0.5 * 0.1 * 100**2, rel=0.01)
+
+
+def test_seed_decides_everything() -> None:
+    """The same seed gives the same estimate, another one another."""
+    one, same, other = (_simulated(LIDAR, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.position_m, same.position_m)
+    assert not np.allclose(one.position_m[:100], other.position_m[:100])

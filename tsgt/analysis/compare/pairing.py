@@ -30,3 +30,6 @@ class PairedPoses:
     n_outside: int  # of these before or after the reference
     n_reference_gap: int  # inside, but where the reference is invalid or missing
     n_reference_weak: int  # inside, but where its sigma is above the limit that was asked for
+    reference_covariance_common: FloatArray | None = (
+        None  # (K, 6, 6) part that all poses share; None: unknown
+    )

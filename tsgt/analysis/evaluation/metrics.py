@@ -49,15 +49,18 @@ class CentroidErrors:
     position_rms_mm: float
 
 
-NEES_95 = 12.591587  # 95th percentile of the chi-square distribution with 6 degrees of freedom
+NEES_95 = {
+    3: 7.814728,
+    6: 12.591587,
+}  # 95th percentiles of the chi-square distribution, by degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
 class NeesStatistics:
-    """Normalised estimation error squared (NEES) of position and rotation; NaN without poses.
+    """Normalised estimation error squared (NEES) of position and rotation, or of positions alone; NaN without poses.
 
-    Consistent covariances have mean 6 (overconfident: larger) and a share of 0.05 above :data:`NEES_95`. Source: Bar-Shalom,
-    Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4.2.
+    Consistent covariances have mean 6, or 3 (overconfident: larger), and a share of 0.05 above :data:`NEES_95`. Source:
+    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4.2.
     """
 
     mean: float
@@ -66,19 +69,17 @@ class NeesStatistics:
 
     @classmethod
     def of(cls, errors: NDArray[np.float64], covariance: NDArray[np.float64]) -> NeesStatistics:
-        """Compute the NEES of errors, (N, 6), with covariances, (N, 6, 6)."""
-        if not len(errors):
-            return cls(math.nan, math.nan, math.nan)
-        return cls.of_squares(
-            np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
-        )
+        """Compute the NEES of errors, (N, D), with covariances, (N, D, D); D is 6 or 3."""
+        squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
+        return cls.of_squares(squares, degrees_of_freedom=errors.shape[1])
 
     @classmethod
-    def of_squares(cls, nees: NDArray[np.float64]) -> NeesStatistics:
+    def of_squares(cls, nees: NDArray[np.float64], *, degrees_of_freedom: int = 6) -> NeesStatistics:
         """Summarise the NEES of N poses, (N,)."""
         if not len(nees):
             return cls(math.nan, math.nan, math.nan)
-        return cls(mean=float(nees.mean()), above_95=float(np.mean(nees > NEES_95)), max=float(nees.max()))
+        limit = NEES_95[degrees_of_freedom]
+        return cls(mean=float(nees.mean()), above_95=float(np.mean(nees > limit)), max=float(nees.max()))
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.evaluation import held_out_keys, noise_scales_by_axis
+from tsgt.analysis.evaluation import binned, gridded, held_out_keys, noise_scales_by_axis
 from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.refinement import refinement_keys
@@ -16,16 +16,15 @@ from tsgt.analysis.report.calibration import calibration_numbers
 from tsgt.analysis.report.diagnosis_section import diagnosis_numbers
 from tsgt.analysis.report.findings import position_sigma_mm, rotation_sigma_deg
 from tsgt.analysis.report.imu_section import imu_numbers
-from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import nan_median
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
 from tsgt.estimation import Kind, centroid_point, poses_at
 
 if TYPE_CHECKING:
-    from tsgt.analysis.evaluation import InterPrismDistances
+    from tsgt.analysis.evaluation import Bins, Grid, InterPrismDistances
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.report.findings import Difference, Findings, PoseNoise
-    from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
+    from tsgt.analysis.report.motion import DistanceErrorSeries
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
     from tsgt.model import Parameters

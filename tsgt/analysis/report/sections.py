@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.evaluation import binned, gridded
 from tsgt.analysis.figures import TimeAxis, panels_height_mm
 from tsgt.analysis.refinement import refinement_rows, refinement_text
 from tsgt.analysis.report import station_figures as draw
@@ -14,7 +15,6 @@ from tsgt.analysis.report.calibration import calibration_section
 from tsgt.analysis.report.diagnosis_section import diagnosis_section
 from tsgt.analysis.report.imu_section import imu_section
 from tsgt.analysis.report.live_section import live_section
-from tsgt.analysis.report.motion import binned, gridded
 from tsgt.analysis.report.page import (
     MAX_LISTED,
     UNKNOWN,

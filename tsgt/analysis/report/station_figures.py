@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tsgt.analysis.evaluation import InterPrismDistances, PairDistances
+    from tsgt.analysis.evaluation import Bins, Grid, InterPrismDistances, PairDistances
     from tsgt.analysis.figures import TimeAxis
     from tsgt.analysis.report.log import ClockSeries, RadioSeries
-    from tsgt.analysis.report.motion import Bins, DistanceErrorSeries, Grid
+    from tsgt.analysis.report.motion import DistanceErrorSeries
     from tsgt.analysis.report.stations import StationRecord
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
-from tsgt.analysis.evaluation import distances_at_epochs, inter_prism
-from tsgt.analysis.report.motion import BINS, binned, distance_error_series, gridded
+from tsgt.analysis.evaluation import BINS, binned, distances_at_epochs, gridded, inter_prism
+from tsgt.analysis.report.motion import distance_error_series
 from tsgt.estimation import Track, build_tracks
 
 

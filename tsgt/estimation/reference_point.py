@@ -18,6 +18,7 @@ import numpy as np
 from tsgt.estimation.observations import centroid_m
 from tsgt.estimation.pose_batch import Kind
 from tsgt.geometry import (
+    covariance_over_lever_arm,
     invert,
     quaternion_from_rotation,
     rotate,
@@ -95,7 +96,7 @@ def poses_at(batch: PoseBatch, point: ReferencePoint) -> PoseBatch:
     found = dict(zip(names, motion, strict=True))
     continuous = batch.kind[rows] != Kind.INTERPOLATED
     found["covariance"] = _covariance_at(batch.covariance[rows], arm_m, continuous)
-    found["covariance_common"] = _first_order_at(batch.covariance_common[rows], arm_m)
+    found["covariance_common"] = covariance_over_lever_arm(batch.covariance_common[rows], arm_m)
     moved = {name: getattr(batch, name).copy() for name in found}
     for name, values in found.items():
         moved[name][rows] = values
@@ -167,16 +168,9 @@ def _covariance_at(covariance: FloatArray, arm_m: FloatArray, second_order: NDAr
     """
     first_order = covariance.copy()
     first_order[second_order] -= _second_order(covariance[second_order])
-    moved = _first_order_at(first_order, arm_m)
+    moved = covariance_over_lever_arm(first_order, arm_m)
     moved[second_order] += _second_order(moved[second_order])
     return moved
-
-
-def _first_order_at(covariance: FloatArray, arm_m: FloatArray) -> FloatArray:
-    by_error = np.tile(np.eye(6), (len(arm_m), 1, 1))
-    by_error[:, :3, 3:] = -skew(arm_m)
-    moved = by_error @ covariance @ np.swapaxes(by_error, 1, 2)
-    return np.asarray(0.5 * (moved + np.swapaxes(moved, 1, 2)))
 
 
 def _second_order(covariance: FloatArray) -> FloatArray:

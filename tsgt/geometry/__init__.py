@@ -28,6 +28,7 @@ from tsgt.geometry.polar import (
 from tsgt.geometry.pose import (
     Poses,
     check_layout,
+    covariance_over_lever_arm,
     interpolation_error_covariance,
     pose_covariance,
     pose_displacement,
@@ -64,6 +65,7 @@ __all__ = [
     "check_transform",
     "corrected_angles",
     "corrected_distance",
+    "covariance_over_lever_arm",
     "euler_angles_rad",
     "euler_covariance",
     "euler_jacobian",

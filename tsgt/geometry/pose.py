@@ -130,6 +130,17 @@ def twists(
     return rotate(rotation, twist[:, :3]), twist[:, 3:]
 
 
+def covariance_over_lever_arm(covariance: FloatArray, arm_m: FloatArray) -> FloatArray:
+    """Carry pose covariances, (N, 6, 6) with rotations about fixed axes, over lever arms, (N, 3) along the same axes.
+
+    To first order: a rotation error θ displaces the end of the lever arm by θ x arm.
+    """
+    by_error = np.tile(np.eye(6), (len(arm_m), 1, 1))
+    by_error[:, :3, 3:] = -skew(arm_m)
+    moved = by_error @ covariance @ np.swapaxes(by_error, 1, 2)
+    return np.asarray(0.5 * (moved + np.swapaxes(moved, 1, 2)))
+
+
 def check_layout(layout: ArrayLike, names: Sequence[object] | None = None, *, imu: bool = False) -> None:
     """Check that a prism layout, (P, 3) in the robot frame in m, determines poses well; ``names`` are for messages.
 

@@ -4,8 +4,8 @@ Comes in: reference poses with covariance, estimates of other programs (poses or
 of their own point on the robot). Goes out: time offset, extrinsic and frame with uncertainties, and error statistics.
 """
 
-from tsgt.analysis.compare.pairing import PairedPoses
-from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation
+from tsgt.analysis.compare.pairing import PairedPoses, pair
+from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation, initial_relation
 from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
 
 __all__ = [
@@ -16,4 +16,6 @@ __all__ = [
     "PairedPoses",
     "ReferencePoses",
     "Relation",
+    "initial_relation",
+    "pair",
 ]

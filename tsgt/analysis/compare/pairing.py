@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from tsgt.analysis.compare.interpolation import ReferenceTrajectory
+from tsgt.geometry import covariance_over_lever_arm, rotate, rotation_from_quaternion, transform_from
+
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
+    from tsgt.analysis.compare.relation import Relation
+    from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
     from tsgt.geometry import FloatArray
 
 
@@ -33,3 +39,78 @@ class PairedPoses:
     reference_covariance_common: FloatArray | None = (
         None  # (K, 6, 6) part that all poses share; None: unknown
     )
+
+
+def pair(
+    reference: ReferencePoses,
+    estimate: Estimate,
+    relation: Relation,
+    *,
+    max_sigma_m: float | None = None,
+) -> PairedPoses:
+    """Pair each pose of an estimate with the reference at its instant, both of the sensor and in ``station1``.
+
+    ``max_sigma_m``: of the sensor's position by the reference, along its least certain direction; above, the instant is left out.
+    """
+    trajectory = ReferenceTrajectory(reference)
+    stamp_ns = on_reference_clock(estimate, relation)
+    inside = (stamp_ns >= trajectory.start_ns) & (stamp_ns <= trajectory.end_ns)
+    row = np.flatnonzero(inside & trajectory.covers(stamp_ns))
+    n_gap = int(np.count_nonzero(inside)) - len(row)
+    point = trajectory.motion_at(stamp_ns[row]).transform
+    arm_m = rotate(point[:, :3, :3], relation.T_point_sensor[:3, 3])
+    covariance, common = (
+        None
+        if each is None
+        else covariance_over_lever_arm(trajectory.covariance_at(each, stamp_ns[row]), arm_m)
+        for each in (reference.covariance, reference.covariance_common)
+    )
+    n_weak = 0
+    if max_sigma_m is not None and covariance is not None:
+        good = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1] <= max_sigma_m**2
+        n_weak = len(row) - int(np.count_nonzero(good))
+        row, point, covariance = row[good], point[good], covariance[good]
+        common = None if common is None else common[good]
+    sensor = point @ relation.T_point_sensor
+    return PairedPoses(
+        row=row,
+        stamp_ns=stamp_ns[row],
+        estimated=_in_station1(estimate, relation, row, sensor),
+        reference=sensor,
+        reference_covariance=covariance,
+        reference_covariance_common=common,
+        estimate_covariance=_covariance_in_station1(estimate, relation, row),
+        has_orientation=estimate.orientation_xyzw is not None,
+        n_estimate=len(stamp_ns),
+        n_outside=int(np.count_nonzero(~inside)),
+        n_reference_gap=n_gap,
+        n_reference_weak=n_weak,
+    )
+
+
+def on_reference_clock(estimate: Estimate, relation: Relation) -> NDArray[np.int64]:
+    """Return the instants of an estimate's poses on the reference's clock, (M,)."""
+    since_first_ns = estimate.stamp_ns - estimate.stamp_ns[0]
+    correction_ns = 1e9 * relation.offset_s + relation.skew * since_first_ns
+    return np.asarray(estimate.stamp_ns + np.rint(correction_ns).astype(np.int64))
+
+
+def _in_station1(
+    estimate: Estimate, relation: Relation, row: NDArray[np.intp], sensor: FloatArray
+) -> FloatArray:
+    R, t = relation.T_station1_frame[:3, :3], relation.T_station1_frame[:3, 3]
+    position = relation.scale * rotate(R, estimate.position_m[row]) + t
+    if estimate.orientation_xyzw is None:
+        return transform_from(sensor[:, :3, :3], position)
+    return transform_from(R @ rotation_from_quaternion(estimate.orientation_xyzw[row]), position)
+
+
+def _covariance_in_station1(
+    estimate: Estimate, relation: Relation, row: NDArray[np.intp]
+) -> FloatArray | None:
+    if estimate.covariance is None:
+        return None
+    by_error = np.zeros((6, 6))
+    by_error[:3, :3] = relation.scale * relation.T_station1_frame[:3, :3]
+    by_error[3:, 3:] = relation.T_station1_frame[:3, :3]
+    return np.asarray(by_error @ estimate.covariance[row] @ by_error.T)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from tsgt.geometry import FloatArray
@@ -42,5 +43,12 @@ class Fit:
     relation: Relation
     names: tuple[str, ...]
     covariance: FloatArray  # (P, P) with the estimate's correlated errors allowed for
-    undetermined: tuple[str, ...]  # Of the names: what the motion does not determine; left at its prior
+    unobservable: tuple[
+        str, ...
+    ]  # What the motion does not determine, named likewise; not fitted, left at its prior
     used: NDArray[np.bool_]  # (M,) poses of the estimate that were used: paired, and not outliers of the fit
+
+
+def initial_relation() -> Relation:
+    """Return that of an estimate on the reference's clock, in its frame, of its point."""
+    return Relation(offset_s=0.0, skew=0.0, T_point_sensor=np.eye(4), T_station1_frame=np.eye(4), scale=1.0)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 PATH_TOLERANCE = 0.1  # As in evo
 TIME_TOLERANCE = 0.01  # Epochs are regular
+STEP_TOLERANCE = 0.5  # Of the median step: the last poses have no partner
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,9 @@ def pairs_by_time(stamp_ns: NDArray[np.int64], delta_s: float) -> NDArray[np.int
 
     evo has no such unit. Without a gap, it is the same as its ``--delta_unit f --all_pairs`` with the number of poses in that time.
     """
-    return _closest((stamp_ns - stamp_ns[:1]) / 1e9, delta_s, TIME_TOLERANCE * delta_s)
+    time_s = (stamp_ns - stamp_ns[:1]) / 1e9
+    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else delta_s
+    return _closest(time_s, delta_s, min(TIME_TOLERANCE * delta_s, STEP_TOLERANCE * step_s))
 
 
 def _consecutive(steps_m: list[float], delta_m: float) -> NDArray[np.intp]:

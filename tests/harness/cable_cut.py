@@ -16,8 +16,6 @@ from harness.network import (
     Followed,
     Master,
     network,
-    stopping,
-    wait_until,
 )
 
 from tsgt.radio.key_file import write_key
@@ -58,18 +56,17 @@ def cut_cable(folder: Path, cut_s: float, hold_s: float) -> CableCut:
     with (
         network() as pair,
         Master(socket).running(),
-        stopping(pair.start(pair.robot, relay, folder, "relay")),
-        stopping(pair.start(pair.reader, reader, folder, "reader")),
+        pair.start(pair.robot, relay, folder, "relay"),
+        pair.start(pair.reader, reader, folder, "reader") as following,
     ):
-        wait_until(folder / "reader.out", 40)
+        following.wait_for_lines(40)
         pair.cable(plugged=False)
         time.sleep(cut_s)
         pair.cable(plugged=True)
         repaired_ns = time.time_ns()
-        lines = (folder / "reader.out").read_bytes().count(b"\n")
-        wait_until(folder / "reader.out", lines + 1)
+        following.wait_for_lines(following.lines() + 1)
         time.sleep(2)
-    found = Followed.read(folder / "reader.out")
+    found = Followed.read(following.output)
     stamps, arrived = found.stamps_ns, found.arrived_ns
     return CableCut(
         sent=(max(stamps) - min(stamps)) // PERIOD_NS + 1,

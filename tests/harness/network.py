@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from socket import AF_UNIX
 from socket import socket as Socket  # noqa: N812 (a class)
 from typing import TYPE_CHECKING
 
+from harness.processes import Program
 from harness.records import HELLO, POSE, SETUP
 
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
 ROBOT_ADDRESS = "10.213.77.1"
 READER_ADDRESS = "10.213.77.2"
 PERIOD_NS = 50_000_000
@@ -55,20 +54,9 @@ class Network:
         """Pull the cable out, or put it in."""
         _ip("-n", self.robot, "link", "set", "cable", "up" if plugged else "down")
 
-    def start(
-        self, namespace: str, command: Sequence[str], folder: Path, name: str
-    ) -> subprocess.Popen[bytes]:
-        """Start a program on one of the computers; its output goes to NAME.out and NAME.err."""
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-        with (folder / f"{name}.out").open("wb") as output, (folder / f"{name}.err").open("wb") as errors:
-            return subprocess.Popen(
-                [IP, "netns", "exec", namespace, *command],
-                stdout=output,
-                stderr=errors,
-                cwd=ROOT,
-                env=environment,
-                start_new_session=True,
-            )
+    def start(self, namespace: str, command: Sequence[str], folder: Path, name: str) -> Program:
+        """Start a program on one of the computers."""
+        return Program([IP, "netns", "exec", namespace, *command], folder, name, leads=True)
 
 
 @contextmanager
@@ -93,23 +81,6 @@ def network() -> Iterator[Network]:
 
 def _ip(*arguments: str) -> None:
     subprocess.run([IP, *arguments], check=True, capture_output=True)
-
-
-@contextmanager
-def stopping(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]:
-    """Stop a process at the end, and its children if it leads a session."""
-    try:
-        yield process
-    finally:
-        leads = os.getsid(process.pid) == process.pid if process.poll() is None else False
-        for number in (signal.SIGTERM, signal.SIGKILL):
-            with suppress(ProcessLookupError):
-                if leads:
-                    os.killpg(process.pid, number)
-                else:
-                    process.send_signal(number)
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(5)
 
 
 @dataclass
@@ -202,12 +173,3 @@ class Followed:
             gaps=[None if row[1] == "None" else int(row[1]) for row in rows if row[0] == "gap"],
             greetings=sum(row[0] == "hello" for row in rows),
         )
-
-
-def wait_until(path: Path, lines: int, timeout_s: float = 20.0) -> None:
-    """Return when a program has printed so many lines."""
-    deadline = time.monotonic() + timeout_s
-    while path.read_bytes().count(b"\n") < lines:
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"{path} has {path.read_text()!r}")
-        time.sleep(0.05)

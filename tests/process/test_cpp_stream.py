@@ -5,27 +5,24 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
-import socket
 import subprocess
-import sys
-import threading
-import time
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.network import PERIOD_NS, Master, stopping, wait_until
+from harness.network import PERIOD_NS, TSGT, Master
+from harness.processes import ROOT, TIMEOUT_S, Program, free_port
 from harness.records import EVENT, HELLO, NO_POSE, POSE, SETUP
+from harness.stream_lines import lines, serving
 
 from tsgt.radio.key_file import write_key
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "integrations" / "cpp"
 GXX = shutil.which("g++") or ""
 pytestmark = pytest.mark.skipif(not GXX, reason="g++ is not installed")
@@ -50,39 +47,9 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@contextmanager
-def serving(path: Path, *connections: bytes) -> Iterator[None]:
-    """Serve each connection its bytes and close it."""
-
-    def serve() -> None:
-        for data in connections:
-            connection, _ = listener.accept()
-            with connection:
-                connection.sendall(data)
-
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield
-        thread.join(10)
-
-
-@contextmanager
-def printing(program: Path, folder: Path, *arguments: str) -> Iterator[Path]:
-    """Run the example; gives the file with its output."""
-    with (
-        (folder / "out").open("wb") as output,
-        (folder / "err").open("wb") as errors,
-        stopping(subprocess.Popen([program, *arguments], stdout=output, stderr=errors)),
-    ):
-        yield folder / "out"
-
-
-def lines(*records: object) -> bytes:
-    """Return records as on the wire."""
-    return b"".join((line if isinstance(line, bytes) else encode_line(line)) + b"\n" for line in records)
+def printing(program: Path, folder: Path, *arguments: str) -> Program:
+    """Run the example."""
+    return Program([program, *arguments], folder, "example")
 
 
 def test_numbers_arrive_to_the_last_bit(program: Path, tmp_path: Path) -> None:
@@ -93,9 +60,9 @@ def test_numbers_arrive_to_the_last_bit(program: Path, tmp_path: Path) -> None:
         b'{"type":"weather","x":[{"y":"\\u00e9\\ud83d\\ude00"}]}',
         AWKWARD,
     )
-    with serving(tmp_path / "s", lines(*sent)), printing(program, tmp_path, str(tmp_path / "s")) as output:
-        wait_until(output, 2)
-        hello, pose = output.read_text().splitlines()[:2]
+    with serving(tmp_path / "s", lines(*sent)), printing(program, tmp_path, str(tmp_path / "s")) as example:
+        example.wait_for_lines(2)
+        hello, pose = example.output.read_text().splitlines()[:2]
     assert hello == f"hello {HELLO.version}"
     numbers, age = pose.split("; ")
     kind, stamp, *rest = numbers.split()
@@ -113,12 +80,15 @@ LATEST = """
 #include "tsgt_stream.hpp"
 int main(int, char** argv) {
   tsgt::Stream stream(argv[1]);
-  const auto start = tsgt::monotonic_ns();
   std::int64_t last = 0;
-  while (tsgt::monotonic_ns() - start < 3000000000) {
+  for (int poses = 0; poses < 20 || last != -1;) {
     const auto* pose = stream.latest(0.3);
     const std::int64_t stamp = pose == nullptr ? -1 : pose->stamp_ns;
-    if (stamp != last) std::printf("%" PRId64 "\\n", stamp);
+    if (stamp != last) {
+      std::printf("%" PRId64 "\\n", stamp);
+      std::fflush(stdout);
+      poses += pose != nullptr;
+    }
     last = stamp;
     poll(nullptr, 0, 5);
   }
@@ -139,15 +109,18 @@ def test_latest_pose_becomes_stale(tmp_path: Path) -> None:
         str(tmp_path / "latest.cpp"),
     ]
     subprocess.run(command, check=True)
-    with Master(tmp_path / "s").running() as master:
-        program = subprocess.Popen([tmp_path / "latest", tmp_path / "s"], stdout=subprocess.PIPE, text=True)
-        time.sleep(1.5)
-    printed, _ = program.communicate(timeout=20)
-    first, *poses, last = map(int, printed.split())
+    with Program([tmp_path / "latest", tmp_path / "s"], tmp_path, "latest") as program:
+        with Master(tmp_path / "s").running() as master:
+            program.wait_for_lines(30)
+        assert program.ended() == 0
+    first, *printed, last = map(int, program.output.read_text().split())
     assert (first, last) == (-1, -1)
-    assert len(poses) >= 20
-    assert [after - before for before, after in itertools.pairwise(poses)] == [PERIOD_NS] * (len(poses) - 1)
-    assert poses[-1] == master.first_ns + (master.sent - 1) * PERIOD_NS
+    # On a busy machine some are too late, or overtaken.
+    poses = [stamp for stamp in printed if stamp != -1]
+    steps = [after - before for before, after in itertools.pairwise(poses)]
+    assert all(step > 0 and step % PERIOD_NS == 0 for step in steps)
+    assert steps.count(PERIOD_NS) > len(steps) // 2
+    assert poses[-1] <= master.first_ns + (master.sent - 1) * PERIOD_NS
 
 
 def test_gaps_events_and_reasons_are_told(program: Path, tmp_path: Path) -> None:
@@ -155,10 +128,10 @@ def test_gaps_events_and_reasons_are_told(program: Path, tmp_path: Path) -> None
     first = lines(HELLO, NO_POSE, EVENT, b'{"type":"pose"}', b'{"type":')
     with (
         serving(tmp_path / "s", first, lines(HELLO)),
-        printing(program, tmp_path, str(tmp_path / "s")) as output,
+        printing(program, tmp_path, str(tmp_path / "s")) as example,
     ):
-        wait_until(output, 8)
-        found = output.read_text().splitlines()
+        example.wait_for_lines(8)
+        found = example.output.read_text().splitlines()
     assert [line.split("; ")[0] for line in found] == [
         f"hello {HELLO.version}",
         f"pose {NO_POSE.stamp_ns} invalid: outage",
@@ -182,7 +155,7 @@ def test_other_streams_are_errors(program: Path, tmp_path: Path, data: bytes, er
     """Another attempt would not help."""
     with serving(tmp_path / "s", data):
         done = subprocess.run(
-            [program, tmp_path / "s"], capture_output=True, text=True, check=False, timeout=20
+            [program, tmp_path / "s"], capture_output=True, text=True, check=False, timeout=TIMEOUT_S
         )
     assert done.returncode == 1
     assert error in done.stderr
@@ -190,41 +163,31 @@ def test_other_streams_are_errors(program: Path, tmp_path: Path, data: bytes, er
 
 @contextmanager
 def relay(folder: Path, port: int) -> Iterator[str]:
-    """Run a relay; gives its address."""
+    """Run a relay; gives its address once it has connected to the master."""
     command = [
-        sys.executable, "-m", "tsgt", "relay", "--socket", str(folder / "s"), "--key", str(folder / "relay.key"),
-        "--listen", f"127.0.0.1:{port}",
+        *TSGT, "relay", "--socket", str(folder / "s"), "--key", str(folder / "relay.key"), "--listen", f"127.0.0.1:{port}",
     ]  # fmt: skip
-    with (folder / "relay.log").open("ab") as log, stopping(subprocess.Popen(command, cwd=ROOT, stderr=log)):
+    with Program(command, folder, "relay") as running:
+        running.wait_for("relay_source_connected")
         yield f"relay://127.0.0.1:{port}"
-
-
-def free_port() -> int:
-    """Return a port that no program uses."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def test_relay_is_read_and_its_restart_told(program: Path, tmp_path: Path) -> None:
     """Handshake and tags are right; after the relay's restart it goes on with a gap."""
     write_key(tmp_path / "relay.key")
-    port = free_port()
-    with Master(tmp_path / "s").running():
-        with relay(tmp_path, port) as address:
-            time.sleep(1)
-            with printing(program, tmp_path, address, str(tmp_path / "relay.key")) as output:
-                wait_until(output, 20)
-                stopped = output.read_bytes().count(b"\n")
-                assert stopped >= 20
-        with (
-            relay(tmp_path, port) as address,
-            printing(program, tmp_path, address, str(tmp_path / "relay.key")) as output,
-        ):
-            wait_until(output, 20)
-    found = output.read_text().splitlines()
-    assert found[0] == f"hello {HELLO.version}"
-    assert [line.split()[0] for line in found[1:]] == ["pose"] * (len(found) - 1)
+    address = f"relay://127.0.0.1:{(port := free_port())}"
+    with (
+        Master(tmp_path / "s").running(),
+        printing(program, tmp_path, address, str(tmp_path / "relay.key")) as example,
+    ):
+        for poses in (20, 40):
+            with relay(tmp_path, port):
+                example.wait_for_lines(poses)
+    kinds = [line.split()[0] for line in example.output.read_text().splitlines()]
+    assert kinds.count("hello") == 2
+    assert kinds.count("gap") >= 1
+    assert kinds[0] == "hello"
+    assert kinds[-1] == "pose"
 
 
 def test_wrong_key_gets_nothing(program: Path, tmp_path: Path) -> None:
@@ -232,8 +195,7 @@ def test_wrong_key_gets_nothing(program: Path, tmp_path: Path) -> None:
     write_key(tmp_path / "relay.key")
     write_key(tmp_path / "other.key")
     with Master(tmp_path / "s").running(), relay(tmp_path, free_port()) as address:
-        time.sleep(1.5)
         command = [str(program), address, str(tmp_path / "other.key")]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=20)
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
     assert (done.returncode, done.stdout) == (1, "")
     assert "the relay has another key" in done.stderr

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-import time
 from typing import TYPE_CHECKING
 
 import pytest
 from harness.cable_cut import cut_cable
-from harness.network import FOLLOW, ROBOT_ADDRESS, TSGT, Master, missing, network, stopping
+from harness.network import FOLLOW, ROBOT_ADDRESS, TSGT, Master, missing, network
 
 from tsgt.radio.key_file import write_key
 
@@ -49,10 +48,10 @@ def test_wrong_key_gets_nothing(tmp_path: Path) -> None:
     with (
         network() as pair,
         Master(socket).running(),
-        stopping(pair.start(pair.robot, relay, tmp_path, "relay")),
+        pair.start(pair.robot, relay, tmp_path, "relay") as serving,
     ):
-        time.sleep(1)
-        with stopping(pair.start(pair.reader, reader, tmp_path, "reader")) as process:
-            process.wait(20)
-    assert (tmp_path / "reader.out").read_text() == ""
-    assert "the relay has another key" in (tmp_path / "reader.err").read_text()
+        serving.wait_for("relay_source_connected")
+        with pair.start(pair.reader, reader, tmp_path, "reader") as reading:
+            reading.ended()
+    assert reading.output.read_text() == ""
+    assert "the relay has another key" in reading.log.read_text()

@@ -21,8 +21,6 @@ from harness.network import (
     Master,
     missing,
     network,
-    stopping,
-    wait_until,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -70,20 +68,16 @@ def test_stream_through_ssh(tmp_path: Path) -> None:
     with (
         network() as pair,
         Master(remote).running(),
-        stopping(
-            pair.start(pair.robot, [SSHD, "-D", "-e", "-f", str(tmp_path / "sshd_config")], tmp_path, "sshd")
-        ),
-        stopping(pair.start(pair.reader, again, tmp_path, "ssh")),
-        stopping(pair.start(pair.reader, [sys.executable, "-c", FOLLOW, str(local), ""], tmp_path, "reader")),
+        pair.start(pair.robot, [SSHD, "-D", "-e", "-f", str(tmp_path / "sshd_config")], tmp_path, "sshd"),
+        pair.start(pair.reader, again, tmp_path, "ssh"),
+        pair.start(pair.reader, [sys.executable, "-c", FOLLOW, str(local), ""], tmp_path, "reader") as reader,
     ):
-        output = tmp_path / "reader.out"
-        wait_until(output, 40)
+        reader.wait_for_lines(40)
         pair.cable(plugged=False)
         time.sleep(12)
         pair.cable(plugged=True)
-        before = output.read_bytes().count(b"\n")
-        wait_until(output, before + 40)
-    found = Followed.read(output)
+        reader.wait_for_lines(reader.lines() + 40)
+    found = Followed.read(reader.output)
     assert found.gaps == [None]
     assert found.greetings == 2
     steps = [after - before for before, after in itertools.pairwise(found.stamps_ns)]

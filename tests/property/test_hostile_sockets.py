@@ -6,7 +6,6 @@ import asyncio
 import json
 import socket
 import tempfile
-import threading
 import unicodedata
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -21,13 +20,14 @@ from harness.damage import Damage, damages, examples
 from harness.radios import PAPER, running_timeline
 from harness.records import CLOCK, EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
 from harness.scripted_instrument import ScriptedInstrument
+from harness.stream_lines import lines, serving
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, StreamError
 from tsgt.master.stream_server import StreamServer
-from tsgt.recording import MAX_LINE_BYTES, encode_line
+from tsgt.recording import MAX_LINE_BYTES
 from tsgt.recording.journal import InstrumentRecord
 from tsgt.simulation.kernel import VirtualClock, run_virtual
 from tsgt.simulation.lora import AirClient, AirServer, LinkModel
@@ -54,16 +54,12 @@ FRAME = FrameMessage.of(frame())
 SETTINGS = InstrumentRecord(make="Leica", prism_type="round", prism_constant_m=0.0, atmospheric_ppm=8.1)
 
 
-def _lines(*records: object) -> bytes:
-    return b"".join(encode_line(record) + b"\n" for record in records)
-
-
-STREAM = _lines(HELLO, measurement(0), POINT, POSE, NO_POSE, STATUS, CLOCK, EVENT)
-STATUS_STREAM = _lines(HELLO, POSE, STATUS)
-REQUESTS = [_lines(AtmosphereRequest(temperature_c=25.0, pressure_hpa=1000.0)), STREAM]
-TO_AIR = [_lines(Join(name="x"), Transmit(frame=FRAME), Stop(at_ns=5_000_000), Transmit(frame=FRAME))]
+STREAM = lines(HELLO, measurement(0), POINT, POSE, NO_POSE, STATUS, CLOCK, EVENT)
+STATUS_STREAM = lines(HELLO, POSE, STATUS)
+REQUESTS = [lines(AtmosphereRequest(temperature_c=25.0, pressure_hpa=1000.0)), STREAM]
+TO_AIR = [lines(Join(name="x"), Transmit(frame=FRAME), Stop(at_ns=5_000_000), Transmit(frame=FRAME))]
 FROM_AIR = [
-    _lines(
+    lines(
         Welcome(seed=3, noise_figure_db=6.0),
         Incoming(sender="a", crystal_ppm=1.0, loss_db=80.0, loss_probability=0.0, frame=FRAME),
         Stopped(sender="a", at_ns=30_000_000),
@@ -228,32 +224,12 @@ def _in_folder(run: object) -> None:
 # --- Commands that read from a socket
 
 
-@contextmanager
-def serving(path: Path, content: bytes) -> Iterator[None]:
-    """Send data to the first client and disconnect."""
-
-    def serve() -> None:
-        connection, _ = listener.accept()
-        with connection, suppress(OSError):
-            connection.sendall(content)
-
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield
-        with suppress(OSError), socket.socket(socket.AF_UNIX) as last:
-            last.connect(str(path))  # for a server that nobody has come to
-        thread.join()
-
-
 COMMANDS = {
     "listen": (("listen",), [STREAM]),
     "status": (("status",), [STATUS_STREAM, STREAM]),
     "atmosphere": (
         ("atmosphere", "20", "1000"),
-        [b'{"type":"client_status"}\n' + _lines(AtmosphereResponse(settings=SETTINGS))],
+        [b'{"type":"client_status"}\n' + lines(AtmosphereResponse(settings=SETTINGS))],
     ),
 }
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import itertools
 import socket
-import threading
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 from harness.records import EVENT, HELLO, NO_POSE, POSE, STATUS, measurement
+from harness.stream_lines import lines, serving
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,7 +28,6 @@ from tsgt.client import (
 )
 from tsgt.client.links import Arrival, SocketLink
 from tsgt.errors import StreamError
-from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,35 +39,9 @@ MS = 1_000_000
 PREDICTED = replace(POSE, kind="predicted")
 
 
-def lines(*records: object) -> bytes:
-    """Return records as on the wire."""
-    return b"".join(
-        record + b"\n" if isinstance(record, bytes) else encode_line(record) + b"\n" for record in records
-    )
-
-
 def predicted(number: int) -> object:
     """Return one of the predicted poses, 50 ms apart."""
     return replace(PREDICTED, stamp_ns=PREDICTED.stamp_ns + number * 50 * MS)
-
-
-@contextmanager
-def serving(path: Path, *connections: bytes) -> Iterator[None]:
-    """Serve each connection its bytes and close it."""
-
-    def serve() -> None:
-        for data in connections:
-            connection, _ = listener.accept()
-            with connection:
-                connection.sendall(data)
-
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
-        thread = threading.Thread(target=serve, daemon=True)
-        thread.start()
-        yield
-        thread.join(10)
 
 
 async def _gather(path: Path, count: int, *, reconnect: bool) -> list[Record]:

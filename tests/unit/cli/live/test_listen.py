@@ -6,18 +6,16 @@ import json
 import socket
 import subprocess
 import sys
-import threading
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 from harness.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
+from harness.stream_lines import serving
 
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from harness.cli import Tsgt
@@ -33,26 +31,6 @@ STATUS_TEXT = (
     "22:13:22.000  status  19 of 20 poses valid; station 1: 4 of 5 usable, last ok 0.20 s ago; "
     "station 2: no measurement yet"
 )
-
-
-@contextmanager
-def serving(path: Path, data: bytes) -> Iterator[None]:
-    """Serve one reader the data, then close the connection."""
-
-    def serve() -> None:
-        connection, _ = listener.accept()
-        with connection:
-            connection.sendall(data)
-
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(str(path))
-        listener.listen()
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
-            yield
-        finally:
-            thread.join()
 
 
 def test_control_characters_are_replaced(tsgt: Tsgt, tmp_path: Path) -> None:

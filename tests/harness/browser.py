@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
-START_TIMEOUT_S = 30.0
-CALL_TIMEOUT_S = 20.0
+START_TIMEOUT_S = 60.0
+CALL_TIMEOUT_S = 60.0
 POLL_S = 0.05
 
 _OPTIONS = (

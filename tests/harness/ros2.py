@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from harness.processes import TIMEOUT_S
 from harness.records import HELLO, PARAMETERS, POSE, STATUS, measurement
 
 from tsgt.recording import SetupRecord, encode_line
@@ -57,15 +58,15 @@ class RosSystem:
         self._listener = self._stack.enter_context(socket.socket(socket.AF_UNIX))
         self._listener.bind(str(self._path))
         self._listener.listen()
-        self._listener.settimeout(30)
+        self._listener.settimeout(TIMEOUT_S)
         arguments = [f"source:={self._path}", *self._parameters]
         options = [item for argument in arguments for item in ("-p", argument)]
         self.node = self._run(NODE, "--ros-args", *options)
         self.accept()
-        self._subscriber = self._run(SUBSCRIBER)
+        self.subscriber = self._run(SUBSCRIBER)
         reading = threading.Thread(target=self._read)
         self._stack.callback(reading.join, 10)
-        self._stack.callback(self._subscriber.terminate)
+        self._stack.callback(self.subscriber.terminate)
         reading.start()
         self.wait_for("/tf_static")
         self.wait_for("/diagnostics")
@@ -75,13 +76,13 @@ class RosSystem:
     def _wait_until_all_topics_are_connected(self) -> None:
         """Send until everything arrives: the subscriber finds each topic at its own time."""
         rng = random.Random(0)  # noqa: S311 (no secret)
+        since_s = time.monotonic()
         moving = ("/tsgt/pose", "/tsgt/odometry", "/tf", "/tsgt/prism1")
-        for _ in range(100):
+        while not all(self.messages(topic) for topic in moving):
+            self._check(since_s, "a topic is not connected")
             now = time.time_ns()
             self.send(random_pose(rng, now), replace(measurement(0), stamp_ns=now, received_ns=now))
             time.sleep(0.1)
-            if all(self.messages(topic) for topic in moving):
-                break
         time.sleep(0.5)
         self._received[:] = [each for each in self._received if each.topic not in moving]
 
@@ -108,8 +109,8 @@ class RosSystem:
         return process
 
     def _read(self) -> None:
-        assert self._subscriber.stdout is not None
-        for line in self._subscriber.stdout:
+        assert self.subscriber.stdout is not None
+        for line in self.subscriber.stdout:
             self._received.append(Received(**json.loads(line)))
 
     def accept(self) -> None:
@@ -144,14 +145,19 @@ class RosSystem:
         """Return what the subscriber has received on a topic so far."""
         return [received for received in list(self._received) if received.topic == topic]
 
-    def wait_for(self, topic: str, count: int = 1, *, within_s: float = 30.0) -> list[Received]:
+    def wait_for(self, topic: str, count: int = 1) -> list[Received]:
         """Wait until a topic has this number of messages."""
-        deadline = time.monotonic() + within_s
+        since_s = time.monotonic()
         while len(found := self.messages(topic)) < count:
-            if time.monotonic() > deadline:
-                raise AssertionError(f"{topic}: {len(found)} of {count} messages within {within_s} s")
+            self._check(since_s, f"{topic}: {len(found)} of {count} messages")
             time.sleep(0.02)
         return found
+
+    def _check(self, since_s: float, problem: str) -> None:
+        """Fail when node or subscriber has ended, or after too long."""
+        ended = [program.args for program in (self.node, self.subscriber) if program.poll() is not None]
+        assert not ended, f"{problem}; ended: {ended}"
+        assert time.monotonic() - since_s < TIMEOUT_S, problem
 
 
 def random_pose(rng: random.Random, stamp_ns: int) -> PoseRecord:

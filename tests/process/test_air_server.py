@@ -6,11 +6,13 @@ import os
 import subprocess
 import sys
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
+
+from harness.processes import ROOT, TIMEOUT_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 SERVER = """
 import asyncio, sys
@@ -23,7 +25,7 @@ from tsgt.simulation.lora.link import LinkModel
 async def main():
     async with AirServer(Path(sys.argv[1]), LinkModel(), np.random.default_rng(0)):
         print("ready", flush=True)
-        await asyncio.sleep(60)
+        await asyncio.sleep(600)
 
 configure_logging()
 asyncio.run(main())
@@ -90,7 +92,7 @@ except* Exception as errors:
 @contextmanager
 def running(program: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
     """Run a program, at most until the end of the block."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         [sys.executable, "-c", program, *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -118,7 +120,7 @@ def test_two_processes_exchange_packets_over_the_air_server(tmp_path: Path) -> N
         with running(RADIO, path, "answer") as answering:
             assert first_line(answering) == "ready"
             with running(RADIO, path, "ask") as asking:
-                out, err = asking.communicate(timeout=10)
+                out, err = asking.communicate(timeout=TIMEOUT_S)
                 assert asking.returncode == 0, err
             answers = [line.rsplit(maxsplit=1) for line in out.splitlines()]
             assert [text for text, _ in answers] == [f"answer {number}" for number in range(5)]
@@ -126,6 +128,6 @@ def test_two_processes_exchange_packets_over_the_air_server(tmp_path: Path) -> N
             assert all(24_584_000 < int(turn_ns) < 500_000_000 for _, turn_ns in answers)
 
             server.kill()
-            _, err = answering.communicate(timeout=10)
+            _, err = answering.communicate(timeout=TIMEOUT_S)
             assert answering.returncode == 1
             assert err.splitlines()[-1].endswith("the server has closed the connection")

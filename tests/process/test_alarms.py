@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness.processes import TIMEOUT_S
 from harness.records import EVENT
 from structlog.testing import capture_logs
 
@@ -72,10 +73,10 @@ async def delivered_to_both(note: Path, logs: Sequence[Mapping[str, Any]]) -> by
         command=(sys.executable, "-c", NOTE, str(note)),
         webhook=f"http://127.0.0.1:{port}/alarm?key=1",
     )
-    async with server, asyncio.timeout(20):
-        task = asyncio.create_task(served(config, [LOST], 20.0))
+    async with server, asyncio.timeout(TIMEOUT_S):
+        task = asyncio.create_task(served(config, [LOST], TIMEOUT_S))
         body = await received.get()
-        for _ in range(1000):
+        for _ in range(3000):
             if ("alarm_sent", "command") in outcomes(logs):
                 break
             await asyncio.sleep(0.02)
@@ -107,7 +108,7 @@ def test_stalled_server_delays_nothing(tmp_path: Path, monkeypatch: pytest.Monke
     assert (tmp_path / "note").exists()
     assert outcomes(logs).count(("alarm_sent", "command")) == 2
     assert [log["error"] for log in logs if log["event"] == "alarm_failed"] == ["killed after 2 s"]
-    assert longest_s < 0.5
+    assert longest_s < 1.0  # the program is killed after 2 s
 
 
 def test_command_that_hangs_is_killed_with_its_children(
@@ -119,7 +120,7 @@ def test_command_that_hangs_is_killed_with_its_children(
     problem = asyncio.run(run_command(("sh", "-c", script), {}, stdin=b"x" * 1_000_000))
     assert problem == "killed after 0.5 s"
     pid = int((tmp_path / "pid").read_text())
-    until_s = time.monotonic() + 5
+    until_s = time.monotonic() + TIMEOUT_S
     while is_running(pid):
         assert time.monotonic() < until_s
         time.sleep(0.01)

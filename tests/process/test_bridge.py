@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.processes import TIMEOUT_S
 from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock
@@ -59,8 +60,8 @@ def alive(pid: int) -> bool:
 
 
 def gone(pid: int) -> bool:
-    """Wait up to a second until a process is gone."""
-    until = time.monotonic() + 1.0
+    """Wait until a process is gone."""
+    until = time.monotonic() + TIMEOUT_S
     while alive(pid) and time.monotonic() < until:
         time.sleep(0.01)
     return not alive(pid)
@@ -192,7 +193,7 @@ def test_endless_output_is_bounded() -> None:
         started_s = time.monotonic()
         with pytest.raises(InstrumentError, match="more than 1000 lines in a second"):
             await instrument.connect()
-        assert time.monotonic() - started_s < 2.0
+        assert time.monotonic() - started_s < 10.0
 
     with_program("yes", use=use)
     with_program("cat", "/dev/zero", use=use)
@@ -268,7 +269,7 @@ def test_client_survives_repeated_kills_of_its_program(tmp_path: Path) -> None:
             pid = last_started(notes, 4)
         finally:
             client.terminate()
-        assert client.wait(10) == 0
+        assert client.wait(TIMEOUT_S) == 0
     assert gone(pid)
     (path,) = (tmp_path / "journals").iterdir()
     journalled = [measurement.instrument_time_ns for measurement in load_journal(path).measurements]
@@ -282,7 +283,7 @@ def test_client_survives_repeated_kills_of_its_program(tmp_path: Path) -> None:
 
 def last_started(notes: Path, runs: int) -> int:
     """Wait until the program has started and measured often enough; return its process."""
-    for _ in range(2000):
+    for _ in range(6000):
         *_, last = ["", *notes.read_text().split("start ")]
         if notes.read_text().count("start") == runs and last.count("\n") > ENOUGH:
             return int(last.splitlines()[0])

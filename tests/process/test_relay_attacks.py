@@ -93,7 +93,7 @@ def test_thousand_connections_keep_no_reader_out(
         second = opened.enter_context(Stream(source, key=key))
         started = time.monotonic()
         assert isinstance(next(second.poses()), Pose)
-        assert time.monotonic() - started < 3
+        assert time.monotonic() - started < 10
         until = time.monotonic() + 0.5
         while time.monotonic() < until:
             next(poses)

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from harness.processes import TIMEOUT_S
 from harness.records import EVENT, HELLO, POSE, STATUS, measurement
 
 from tsgt.model import Status
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-TIMEOUT_S = 30.0
 COLUMNS, ROWS = 40, 30
 STATION = StationStatus(
     id=1, measurements=5, usable=5, age_s=0.2, status=Status.OK, last_heard_s=0.1, answering=True
@@ -81,8 +81,9 @@ class Terminal:
         until_s = time.monotonic() + TIMEOUT_S
         read = ""
         while text not in read:
-            assert time.monotonic() < until_s, self.written[-2000:]
+            ended = self.process.poll() is not None
             read += self.read()
+            assert text in read or not (ended or time.monotonic() > until_s), self.written[-2000:]
         return read
 
     def end(self) -> tuple[int, str]:

@@ -475,7 +475,8 @@ class InertialFixedLagSmoother(MeasurementWindow):
             if np.abs(times_s - each).min() > 0.5 * MIN_KNOT_SPACING_S:
                 times_s = np.sort(np.append(times_s, each))
         if added and times_s[-1] - old_s[-1] > MAX_KNOT_SPACING_S:
-            times_s = np.concatenate([old_s[:-1], _divided(times_s[len(old_s) - 1 :])])
+            newest = int(np.searchsorted(times_s, old_s[-1]))
+            times_s = np.concatenate([times_s[:newest], _divided(times_s[newest:])])
         samples = self._contiguous(times_s)
         # The states of the knots before; those of new ones are propagated below.
         nearest = np.searchsorted(old_s, times_s, side="right") - 1

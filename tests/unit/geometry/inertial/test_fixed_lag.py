@@ -219,6 +219,25 @@ def test_outage_is_bridged_and_tracked_on() -> None:
     assert np.diff(live.window.trajectory().inside.knots.time_s).max() < 0.51
 
 
+def test_backlog_and_an_outage_at_once() -> None:
+    """A station delivers measurements from within the window together with one after a gap: a knot for each, in order."""
+    observations = measurements()
+    live = Live()
+    early = observations.time_s < 4.0
+    held_back = early & (observations.time_s > 3.0) & (observations.station == 1)
+    live.measure(observations.select(early & ~held_back))
+    live.sample_until(5.6)
+    later = (observations.time_s > 5.0) & (observations.time_s < 5.2)
+    assert later.any()
+    live.window.update(observations.select(held_back | later))
+    assert live.window.converged
+    knots_s = live.window.trajectory().inside.knots.time_s
+    steps_s = np.diff(knots_s)
+    assert 0.005 < steps_s.min() <= steps_s.max() < 0.51
+    for time_s in observations.time_s[held_back | later]:
+        assert np.abs(knots_s - time_s).min() <= 0.0101
+
+
 def test_window_does_not_grow() -> None:
     """Numbers of measurements, knots and samples are bounded."""
     window = tracked().window

@@ -1,9 +1,10 @@
 """Many simulated missions with faults of all kinds, each from one seed, and what must never happen counted in all of them.
 
-    python benchmarks/run.py soak [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--imu MODEL] [--stations N] [--json FILE]
+    python benchmarks/run.py soak [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--imu MODEL ...] [--stations N ...] [--json FILE]
 
 Protocol, estimator, losses and drifts change from seed to seed, and with them how often which faults come
-(`tsgt/simulation/faults/catalogue.py`). A line for each violation says how to get the same run again. `make soak` runs it for a
+(`tsgt/simulation/faults/catalogue.py`); with an IMU the rate of the poses, their delays and
+which kinds come at all change too, and of several IMUs and numbers of stations each seed has one. A line for each violation says how to get the same run again. `make soak` runs it for a
 quarter of an hour. With `--json` the sums are kept, and a later call with the same file adds to them and goes on after
 the last seed.
 """
@@ -58,6 +59,9 @@ class Mission:
     drift_ppm: float
     imu: ImuModelName
     stations: int
+    rate_hz: float | None  # of the poses; None: that of the scenario
+    delayed: bool  # whether there are smooth poses at a delay
+    faults: frozenset[FaultKind]  # kinds that may come
 
     @classmethod
     def of(cls, seed: int, imu: ImuModelName = "none", stations: int = STATIONS) -> Mission:
@@ -77,16 +81,36 @@ class Mission:
             round(float(rng.uniform(-50, 50)), 1),
             imu,
             stations,
+            None if imu == "none" else float(rng.choice([5.0, 10.0, 20.0])),
+            imu == "none" or bool(rng.random() < 0.5),
+            frozenset(FaultKind if imu == "none" else _some_kinds(rng)),
         )
+
+    @property
+    def kind(self) -> str:
+        """What its sums are kept by."""
+        kind = f"{self.protocol}, {self.estimator}"
+        return kind if self.imu == "none" else f"{self.imu}, {self.stations} stations, {kind}"
 
     @property
     def command(self) -> str:
         """The command that runs it again."""
+        if self.imu != "none":
+            return (
+                f"python benchmarks/run.py soak --imu {self.imu} --stations {self.stations} "
+                f"--first {self.seed} --seeds 1 --jobs 1"
+            )
         return (
             f"tsgt simulate dynamic --protocol {self.protocol} --duration {DURATION_S:g} --loss {self.loss} "
-            f"--drift-ppm {self.drift_ppm} --faults all --estimator {self.estimator} --imu {self.imu} "
+            f"--drift-ppm {self.drift_ppm} --faults all --estimator {self.estimator} "
             f"--stations {self.stations} --seed {self.seed}"
         )
+
+
+def _some_kinds(rng: np.random.Generator) -> list[FaultKind]:
+    """Draw some: with faults of all kinds the IMU is hardly ever in use, because a drive has to confirm it anew each time."""
+    share = float(rng.choice([0.15, 0.4, 1.0]))
+    return [kind for kind in FaultKind if rng.random() < share]
 
 
 @dataclass(slots=True)
@@ -105,6 +129,8 @@ class Sums:
         How many of each kind.
     measurements, poses
         What was delivered, and how many poses were called valid.
+    with_imu
+        Of these poses, how many rest on the IMU.
     above
         How many valid poses of the continuous estimator exceed each of :data:`LIMITS`, and all of them, by series.
     violations
@@ -118,6 +144,7 @@ class Sums:
     faults: Counter[str] = field(default_factory=Counter)
     measurements: int = 0
     poses: int = 0
+    with_imu: int = 0
     above: Counter[str] = field(default_factory=Counter)
     violations: list[str] = field(default_factory=list)
 
@@ -127,6 +154,7 @@ class Sums:
             getattr(self, name).update(getattr(other, name))
         self.measurements += other.measurements
         self.poses += other.poses
+        self.with_imu += other.with_imu
         self.violations += other.violations
         self.next_seed = max(self.next_seed, other.next_seed)
 
@@ -136,12 +164,17 @@ def run(seed: int, imu: ImuModelName = "none", stations: int = STATIONS) -> Sums
     configure_logging("critical")
     logging.disable(logging.CRITICAL)  # asyncio's, of daemons that are killed
     mission = Mission.of(seed, imu, stations)
-    kind = f"{mission.protocol}, {mission.estimator}"
+    kind = mission.kind
     sums = Sums(next_seed=seed + 1, missions=Counter({kind: 1}))
     scenario = find_scenario("dynamic")
     if stations < STATIONS:
         scenario = with_stations(scenario, stations)
-    pipeline = scenario.pipeline.model_copy(update={"estimator": mission.estimator})
+    changed: dict[str, object] = {"estimator": mission.estimator}
+    if mission.rate_hz is not None:
+        changed["rate_hz"] = mission.rate_hz
+    if not mission.delayed:
+        changed["smoothed_delays_s"] = ()
+    pipeline = scenario.pipeline.model_copy(update=changed)
     radio = scenario.radio.model_copy(update={"loss_probability": mission.loss})
     robot = scenario.imu.model_copy(update={"model": mission.imu})
     scenario = scenario.model_copy(update={"pipeline": pipeline, "radio": radio, "imu": robot})
@@ -152,7 +185,7 @@ def run(seed: int, imu: ImuModelName = "none", stations: int = STATIONS) -> Sums
         protocol=SuperframeMasterConfig(kind="superframe")
         if mission.protocol == "superframe"
         else ClassicMasterConfig(kind="classic", initial_cycles=FAST_SYNC_CYCLES),
-        faults=frozenset(FaultKind),
+        faults=mission.faults,
     )
     began_s = time.process_time()
     with tempfile.TemporaryDirectory(prefix="tsgt-soak-") as folder:
@@ -176,6 +209,7 @@ def _count(done: MissionResult, sums: Sums) -> None:
         poses = session.valid_poses()
         sums.measurements += len(session.measurements)
         sums.poses += len(poses.stamp_ns)
+        sums.with_imu += int(np.count_nonzero(poses.with_imu))
         for series in np.unique(poses.series).tolist():
             some = poses.select(poses.series == series)
             if not len(some.stamp_ns):
@@ -197,10 +231,12 @@ def report(sums: Sums) -> None:
     for kind in sorted(sums.missions):
         speed = sums.simulated_s[kind] / max(1e-3, sums.cpu_s[kind] / 1000)
         print(
-            f"  {kind:24} {sums.missions[kind]:5} missions {sums.simulated_s[kind] / 3600:6.1f} h "
+            f"  {kind:45} {sums.missions[kind]:5} missions {sums.simulated_s[kind] / 3600:6.1f} h "
             f"{speed:5.1f} simulated s per s of CPU"
         )
-    print(f"  {sums.measurements} measurements delivered, {sums.poses} valid poses")
+    print(
+        f"  {sums.measurements} measurements delivered, {sums.poses} valid poses, {sums.with_imu} of them with the IMU"
+    )
     for series in sorted(name.removesuffix(", all") for name in sums.above if name.endswith(", all")):
         if count := sums.above[f"{series}, all"]:
             shares = ", ".join(
@@ -224,15 +260,17 @@ def main() -> int:
     )
     parser.add_argument(
         "--imu",
+        nargs="+",
         choices=["none", "industrial", "consumer"],
-        default="none",
+        default=["none"],
         help="the robot's IMU (default: none)",
     )
     parser.add_argument(
         "--stations",
         type=int,
+        nargs="+",
         choices=[1, 2, 3],
-        default=STATIONS,
+        default=[STATIONS],
         help="how many; fewer than three with an IMU (default: 3)",
     )
     parser.add_argument("--json", type=Path, help="keep the sums here, and go on from them")
@@ -251,7 +289,9 @@ def main() -> int:
         running: set[Future[Sums]] = set()
         while running or (time.monotonic() < ends_s and seed != last):
             while len(running) < arguments.jobs and time.monotonic() < ends_s and seed != last:
-                running.add(pool.submit(run, seed, arguments.imu, arguments.stations))
+                imu = arguments.imu[seed % len(arguments.imu)]
+                stations = arguments.stations[seed // len(arguments.imu) % len(arguments.stations)]
+                running.add(pool.submit(run, seed, imu, stations))
                 seed += 1
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for each in done:

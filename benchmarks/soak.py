@@ -19,6 +19,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import suppress
@@ -196,11 +197,19 @@ def run(seed: int, imu: ImuModelName = "none", stations: int = STATIONS) -> Sums
         except (KeyboardInterrupt, SystemExit):
             raise
         except BaseException as error:  # noqa: BLE001 (whatever it is, it is a finding)
-            found = [f"died: {error!r}"]
+            found = [f"died: {_where(error)}"]
     sums.violations = [f"{mission.command}\n    {each[:400]}" for each in found[:3]]
     sums.simulated_s[kind] = round(DURATION_S)
     sums.cpu_s[kind] = round(1000 * (time.process_time() - began_s))
     return sums
+
+
+def _where(error: BaseException) -> str:
+    """Return the first error of a group, and the last calls before it."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    calls = traceback.extract_tb(error.__traceback__)[-4:]
+    return f"{error!r} in " + ", ".join(f"{Path(each.filename).name}:{each.lineno}" for each in calls)
 
 
 def _count(done: MissionResult, sums: Sums) -> None:

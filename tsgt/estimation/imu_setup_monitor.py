@@ -83,6 +83,8 @@ def check_recorded_setup(
     origin_ns = measurements[0].stamp_ns
     observations, _ = build_observations(parameters, measurements, origin_ns=origin_ns)
     samples = sound_samples(inertial_samples(records, imu, origin_ns), imu)
+    if not len(observations) or not len(samples):
+        return SetupCheck()
     rotation = rotation_from_quaternion(np.array(imu.orientation_xyzw))
     mounting = Mounting(rotation, np.array(imu.position_m) - centroid_m(parameters))
     observations = scale_noise(observations, noise_scales(parameters))

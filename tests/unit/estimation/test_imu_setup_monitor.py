@@ -160,6 +160,23 @@ def turned(imu: ImuParameters, axis: tuple[float, float, float] = (0.0, 0.0, 1.0
 SWAPPED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
+@pytest.mark.parametrize("prisms", [3, 2])
+@pytest.mark.parametrize("measured", [True, False])
+def test_nothing_to_compare(*, prisms: int, measured: bool) -> None:
+    """Without a usable measurement, or without a sample that can be used, a check says nothing."""
+    found = uncalibrated_drive(1.0)
+    parameters = parameters_of(found, calibrated_imu(found))
+    parameters = replace(parameters, prisms=parameters.prisms[:prisms])
+    points = [replace(each, position_m=(1e9, 0.0, 0.0)) for each in point_measurements(found)]
+    if measured:
+        points = point_measurements(found)
+    samples = [
+        replace(each, specific_force_mps2=((1e6, 0.0, 0.0),) * len(each.stamp_ns)) if measured else each
+        for each in imu_records(found)
+    ]
+    assert check_recorded_setup(parameters, points, samples) == SetupCheck()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("setup", "message"),

@@ -367,6 +367,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._next_search_s = -np.inf
             self._reliable_from_s = _measured_twice_s(observations.select(~outliers))
         else:
+            self.residuals_m = np.full((len(observations), 3), np.nan)
             # Samples from before the IMU was sound again contradict the measurements: the next search does without the older half.
             middle_s = 0.5 * (searched.time_s[0] + searched.time_s[-1])
             self._searched = searched.select(searched.time_s >= middle_s)

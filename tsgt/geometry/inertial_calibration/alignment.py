@@ -56,6 +56,10 @@ class Series:
     force: FloatArray
     known: NDArray[np.bool_]  # (N,) where they hold
 
+    def select(self, rows: NDArray[np.intp]) -> Series:
+        """Return points of the grid, in its order."""
+        return Series(self.start_s, self.rate[rows], self.force[rows], self.known[rows])
+
 
 class Products(NamedTuple):
     """Sums of products of the robot's and the IMU's vectors, in their sigmas, as of independent instants."""
@@ -130,17 +134,24 @@ def turns(robot: Series) -> bool:
 
 
 def _turning(robot: Series) -> float:
+    if not robot.known.any():
+        return 0.0
     return float(np.sqrt(np.var(robot.rate[robot.known], axis=0).sum()))
 
 
 def products_at(robot: Series, imu: Series, latency_s: float) -> Products:
     """Return sums of products at a latency, to the nearest step of the grid."""
-    ours, theirs = _overlap(robot, imu, round((latency_s + robot.start_s - imu.start_s) / GRID_S))
+    ours, theirs = overlap_at(robot, imu, latency_s)
     w, g = robot.rate[ours], imu.rate[theirs]
     rates = (w - w.mean(axis=0)).T @ (g - g.mean(axis=0)) / RATE_SIGMA_RADPS**2
     forces = robot.force[ours].T @ imu.force[theirs] / FORCE_SIGMA_MPS2**2
     share = GRID_S / SMOOTHING_S  # Of the points of the grid
     return Products(share * rates, share * forces)
+
+
+def overlap_at(robot: Series, imu: Series, latency_s: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of both series at a latency, to the nearest step of the grid, where both are known."""
+    return _overlap(robot, imu, round((latency_s + robot.start_s - imu.start_s) / GRID_S))
 
 
 def nearest_rotation(products: FloatArray) -> FloatArray:

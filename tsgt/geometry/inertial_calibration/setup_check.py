@@ -23,6 +23,7 @@ from tsgt.geometry.inertial_calibration.alignment import (
     MIN_OVERLAP_S,
     align,
     nearest_rotation,
+    overlap_at,
     products_at,
     series_of_samples,
     series_of_states,
@@ -68,8 +69,9 @@ each would be below so many of these limits.
 """
 
 MIN_OVERLAP_SHARE = 0.6
-"""Of the shorter series, which the other one must overlap at any latency that is tried."""
+"""Of the shorter series, as far as it is known, which the other one must overlap at the stamps and at any latency that is tried."""
 
+MIN_SHARED_S = 7.0  # In which both are known: a share of the shortest drive that is checked
 MIN_MEASUREMENTS = 60
 MIN_EXTENT_M = 0.05  # Between prisms that tell a rotation
 MATRIX_SIGMA = 1e-2  # Of the matrices beside what is configured
@@ -126,14 +128,20 @@ def check_imu_setup(
     mounting : As configured, from that reference point.
     noise : Of the data sheet.
     """
-    robot, imu = series_of_states(states, gravity), series_of_samples(samples)
-    if not turns(robot):
+    if not len(samples):
         return SetupCheck()
-    units = _wrong_units(robot, imu, gravity)
+    robot, imu = series_of_states(states, gravity), series_of_samples(samples)
+    shorter_s = GRID_S * min(np.count_nonzero(each.known) for each in (robot, imu))
+    ours, theirs = overlap_at(robot, imu, 0.0)
+    if GRID_S * len(ours) < max(MIN_SHARED_S, MIN_OVERLAP_SHARE * shorter_s):
+        return SetupCheck()  # the IMU was silent while the robot was measured, or the other way round
+    shared = robot.select(ours)
+    if not turns(shared):
+        return SetupCheck()
+    units = _wrong_units(shared, imu.select(theirs), gravity)
     if units:
         return SetupCheck(tuple(units))
     try:
-        shorter_s = GRID_S * min(len(robot.rate), len(imu.rate))
         alignment = align(robot, imu, min_overlap_s=min(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s))
     except GeometryError:
         text = "the angular rates of the IMU are not those of the robot at any latency: it is another robot's"

@@ -238,6 +238,18 @@ def test_backlog_and_an_outage_at_once() -> None:
         assert np.abs(knots_s - time_s).min() <= 0.0101
 
 
+def test_start_that_fails_after_the_window_has_moved_on() -> None:
+    """Every sixth measurement of the only prism is wrong: no start, and no error though the search reaches back further."""
+    observations = measurements(1)
+    points = observations.points_m.copy()
+    points[::6] += 1.0
+    live = Live()
+    live.measure(replace(observations, points_m=points))
+    assert not live.window.converged
+    assert live.window.observations is not None
+    assert len(live.window.residuals_m) == len(live.window.observations)
+
+
 def test_window_does_not_grow() -> None:
     """Numbers of measurements, knots and samples are bounded."""
     window = tracked().window

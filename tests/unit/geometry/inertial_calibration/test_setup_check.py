@@ -15,6 +15,10 @@ from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding, check_imu_setup
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import Gravity, InertialSamples, Mounting
     from tsgt.geometry.trajectory import Observations, States
@@ -165,3 +169,30 @@ def test_no_false_alarm_on_clean_drives(grade: str) -> None:
     """Twenty drives of each class."""
     for seed in range(20):
         assert drive(grade, 100 + seed).check().findings == (), seed
+
+
+@pytest.mark.parametrize(
+    "held",
+    [
+        lambda time_s: (time_s < 3.0) | (time_s > 47.0),  # back after a silence
+        lambda time_s: time_s % 1.0 < 0.45,  # gaps all the time
+        lambda time_s: time_s > 1e9,
+        lambda time_s: np.isin(np.arange(len(time_s)), (3, 2000)),
+    ],
+)
+def test_few_samples_tell_nothing(held: Callable[[FloatArray], NDArray[np.bool_]]) -> None:
+    """Silences of the IMU are no error of its set-up."""
+    right = drive()
+    samples = right.samples.select(held(right.samples.end_s))
+    assert replace(right, samples=samples).check().findings == ()
+
+
+def test_rest_of_the_turning_robot_tells_no_unit() -> None:
+    """Samples of a part of the drive are compared with the robot's rates of that part."""
+    right = drive()
+    quiet = replace(
+        right.states, angular_velocity=right.states.angular_velocity * (right.states.time_s < 25.0)[:, None]
+    )
+    samples = right.samples.select(right.samples.end_s > 30.0)
+    samples = replace(samples, angular_rate_radps=0.02 * samples.angular_rate_radps)
+    assert replace(right, states=quiet, samples=samples).check() == SetupCheck()

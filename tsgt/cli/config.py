@@ -20,6 +20,7 @@ from tsgt.config import (
     Model,
     PrismLayoutFile,
     ScenarioConfig,
+    SensorMountingFile,
     StationFramesFile,
     SuperframeConfig,
     check_permissions,
@@ -169,6 +170,8 @@ def _summary(content: Model) -> dict[str, Any]:
             return {"stations": [int(number) for number in content.stations]}
         case ImuMountingFile():
             return {"position_m": content.position_m, "latency_ms": content.latency_ms}
+        case SensorMountingFile():
+            return {"position_m": content.position_m, "offset_ms": content.offset_ms}
     raise TypeError(f"no summary for {type(content).__name__}")
 
 

@@ -1,7 +1,7 @@
 """Configuration and set-up files: TOML in, validated models and parameters in SI units out.
 
 The top-level key ``kind`` of a file selects its model: ``client``, ``master``, ``station_frames``, ``prism_layout``,
-``imu_mounting`` or ``scenario``. A path in a file is relative to the folder of that file. ``files`` reads, the models validate,
+``imu_mounting``, ``sensor_mounting`` or ``scenario``. A path in a file is relative to the folder of that file. ``files`` reads, the models validate,
 ``parameters`` converts, ``permissions`` rejects files that everybody can change.
 """
 
@@ -71,7 +71,7 @@ from tsgt.config.scenario import (
     SimulatedStation,
 )
 from tsgt.config.scenario_imu import ImuModelName, ImuSetupErrorConfig, ShakingConfig, SimulatedImu
-from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, StationFramesFile
+from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, SensorMountingFile, StationFramesFile
 
 __all__ = [
     "IMU_NOISE",
@@ -114,6 +114,7 @@ __all__ = [
     "ReferencePointConfig",
     "ScenarioConfig",
     "ScenarioRadioConfig",
+    "SensorMountingFile",
     "SetupConfig",
     "ShakingConfig",
     "SimulatedImu",

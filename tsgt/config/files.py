@@ -13,7 +13,7 @@ from tsgt.config.base import Model
 from tsgt.config.client import ClientConfig
 from tsgt.config.master import MasterConfig
 from tsgt.config.scenario import ScenarioConfig
-from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, StationFramesFile
+from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, SensorMountingFile, StationFramesFile
 from tsgt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,7 +22,13 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 Config = Annotated[
-    ClientConfig | MasterConfig | StationFramesFile | PrismLayoutFile | ImuMountingFile | ScenarioConfig,
+    ClientConfig
+    | MasterConfig
+    | StationFramesFile
+    | PrismLayoutFile
+    | ImuMountingFile
+    | SensorMountingFile
+    | ScenarioConfig,
     Field(discriminator="kind"),
 ]
 
@@ -33,6 +39,7 @@ KINDS: dict[str, type[Model]] = {
     "station_frames": StationFramesFile,
     "prism_layout": PrismLayoutFile,
     "imu_mounting": ImuMountingFile,
+    "sensor_mounting": SensorMountingFile,
     "scenario": ScenarioConfig,
 }
 

@@ -121,6 +121,35 @@ class PrismLayoutFile(Model):
         return self
 
 
+class SensorMountingFile(Model):
+    """Mounting and clock offset of a sensor whose estimate is compared with the reference, written by ``tsgt compare`` or from CAD."""
+
+    kind: Literal["sensor_mounting"]
+    """Kind of this file."""
+    position_m: Place
+    """Origin of its axes in the axes of the reference's point, [x, y, z]."""
+    orientation_xyzw: Row4 = (0.0, 0.0, 0.0, 1.0)
+    """Unit quaternion [x, y, z, w] that rotates coordinates in its axes into those of the reference's point."""
+    position_sigma_mm: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """One sigma of the position along each axis of the point; 0: exact. Without this key the position is unknown where it is fitted."""
+    rotation_sigma_deg: tuple[NotNegative, NotNegative, NotNegative] | None = None
+    """One sigma of the rotation about each axis of the point; 0: exact. Without this key the rotation is unknown where it is fitted."""
+    offset_ms: Annotated[float, Field(ge=-1e12, le=1e12)] = 0.0
+    """Time on the reference's clock less the estimate's stamp."""
+    offset_sigma_ms: NotNegative | None = None
+    """One sigma of it."""
+
+    @model_validator(mode="after")
+    def _is_unit(self) -> SensorMountingFile:
+        _check_unit(self.orientation_xyzw)
+        return self
+
+
+def _check_unit(quaternion: Row4) -> None:
+    if not abs(math.hypot(*quaternion) - 1.0) < _UNIT_TOLERANCE:
+        raise ValueError(f"orientation_xyzw holds {quaternion}, expected a unit quaternion")
+
+
 class ImuMountingFile(Model):
     """Mounting, latency and gyro matrix of the robot's IMU, written by ``tsgt calibrate imu``."""
 
@@ -146,6 +175,5 @@ class ImuMountingFile(Model):
     @model_validator(mode="after")
     def _possible(self) -> ImuMountingFile:
         _check_components(self.covariance, _IMU_COMPONENT, {"imu"})
-        if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < _UNIT_TOLERANCE:
-            raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
+        _check_unit(self.orientation_xyzw)
         return self

@@ -87,7 +87,7 @@ PROBLEMS = {
     ),
     "unknown kind": (
         ('"master"', '"slave"'),
-        'kind = "slave": should be one of "client", "master", "station_frames", "prism_layout", "imu_mounting", "scenario"',
+        'kind = "slave": should be one of "client", "master", "station_frames", "prism_layout", "imu_mounting", "sensor_mounting", "scenario"',
     ),
     "kind that is no text": (('"master"', "[1]"), "kind = [1]: should be one of"),
     "no kind": (('kind = "master"', ""), "kind: missing key; one of"),

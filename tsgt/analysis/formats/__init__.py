@@ -17,6 +17,7 @@ from tsgt.analysis.formats.setup_files import (
     InstrumentErrors,
     write_imu_mounting,
     write_prism_layout,
+    write_sensor_mounting,
     write_station_frames,
 )
 from tsgt.analysis.formats.target_file import (
@@ -64,5 +65,6 @@ __all__ = [
     "write_imu_mounting",
     "write_mcap",
     "write_prism_layout",
+    "write_sensor_mounting",
     "write_station_frames",
 ]

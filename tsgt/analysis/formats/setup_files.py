@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tomli_w
 
+from tsgt.geometry import quaternion_from_rotation
 from tsgt.recording import write_atomically
 
 if TYPE_CHECKING:
@@ -119,6 +121,35 @@ def write_imu_mounting(path: Path, imu: ImuParameters, *, comment: str, covarian
         },
     }
     _write(path, content, covariance, comment)
+
+
+def write_sensor_mounting(
+    path: Path,
+    T_point_sensor: FloatArray,
+    sigma: FloatArray,
+    *,
+    offset_s: float,
+    offset_sigma_s: float,
+    comment: str,
+) -> None:
+    """Write a file of kind ``sensor_mounting``, atomically. Raises OutputFileError if the file cannot be written.
+
+    ``sigma``: (6,) of position and rotation in the axes of the point; NaN, as of the offset: unknown.
+    """
+    content: dict[str, Any] = {
+        "kind": "sensor_mounting",
+        "position_m": [round(each, 7) for each in T_point_sensor[:3, 3].tolist()],
+        "orientation_xyzw": quaternion_from_rotation(T_point_sensor[:3, :3]).tolist(),
+        "offset_ms": round(1e3 * offset_s, 6),
+    }
+    for key, part in (
+        ("position_sigma_mm", 1e3 * sigma[:3]),
+        ("rotation_sigma_deg", np.degrees(sigma[3:])),
+        ("offset_sigma_ms", np.array([1e3 * offset_sigma_s])),
+    ):
+        if np.isfinite(part).all():
+            content[key] = part.tolist() if len(part) > 1 else float(part[0])
+    _write(path, content, None, comment)
 
 
 def _covariance_table(covariance: SetupCovariance) -> str:

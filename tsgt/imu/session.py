@@ -157,7 +157,9 @@ class ImuSession:
             return
         if self._sampler.dropped > dropped:
             self._rejected.add(f"a sample: {self._sampler.problem}", line)
-        if records:
+        # The first fit of the device's clock takes as long as the program may be silent.
+        waiting = self._sampler.clock_skew_ppm is None and self._sampler.dropped == dropped
+        if records or waiting:
             self._last_use_ns = at_ns
             self._rejected.last = ""
         for each in records:

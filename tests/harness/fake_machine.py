@@ -149,6 +149,7 @@ class FakeMachine:
         self.free_bytes = 30_000_000_000
         self.programs: set[str] = set()
         self.start_imu: StartProgram | None = None
+        self.start_odometry: StartProgram | None = None
         self.status: ClientStatus | None = None
         self.served: set[Path] = set()
         self.hal_error: Exception | None = None
@@ -197,6 +198,7 @@ class FakeMachine:
             which=lambda program: f"/usr/bin/{program}" if program in self.programs else None,
             free_bytes=lambda _folder: self.free_bytes,
             start_imu=self.start_imu,
+            start_odometry=self.start_odometry,
             port_holder=lambda path: self.holders.get(path.name),
             latency_timer_ms=lambda _path: self.latency_timer_ms,
             open_port=lambda _path: self.port,

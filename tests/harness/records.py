@@ -19,6 +19,7 @@ from tsgt.recording import (
     EventRecord,
     HelloRecord,
     ImuStatus,
+    OdometryStatus,
     PoseRecord,
     RecordingHeader,
     SetupGeofence,
@@ -147,6 +148,25 @@ IMU_STATUS = ImuStatus(
     saturated=0,
     clock_skew_ppm=-12.5,
     problem="",
+)
+
+
+ODOMETRY_STATUS = OdometryStatus(
+    device="Acme base",
+    samples=400,
+    rate_hz=20.0,
+    age_s=0.08,
+    gaps=1,
+    lost=2,
+    untrusted=3,
+    clock_skew_ppm=None,
+    problem="",
+    use="used",
+    scale=0.0125,
+    scale_sigma=0.002,
+    slip=-0.021,
+    slip_sigma=0.012,
+    rejected=0.25,
 )
 
 

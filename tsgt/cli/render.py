@@ -13,6 +13,7 @@ from tsgt.recording import (
     EventRecord,
     HelloRecord,
     ImuStatus,
+    OdometryStatus,
     PoseRecord,
     SetupRecord,
     SetupStation,
@@ -155,7 +156,15 @@ def _clock(clock: ClockRecord) -> str:
 
 def _status(status: StatusRecord) -> str:
     parts = [*map(_station, status.stations), *([] if status.imu is None else [_imu(status.imu)])]
+    parts += [] if status.odometry is None else [_odometry(status.odometry)]
     return f"{clock_time(status.stamp_ns)}  status  {status.valid_poses} of {status.poses} poses valid; {'; '.join(parts)}"
+
+
+def _odometry(odometry: OdometryStatus) -> str:
+    parts = [f"{odometry.samples} samples", *odometry.figures()]
+    if odometry.age_s is not None:
+        parts.append(f"last {_age(odometry.age_s)} ago")
+    return f"wheel odometry: {', '.join(parts)}"
 
 
 def _imu(imu: ImuStatus) -> str:

@@ -271,6 +271,27 @@ class ImuStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryStatus:
+    """The status of the robot's wheel odometry."""
+
+    device: str
+    samples: int
+    rate_hz: float | None
+    age_s: float | None
+    gaps: int
+    lost: int
+    untrusted: int
+    clock_skew_ppm: float | None
+    problem: str
+    use: str | None = None
+    scale: float | None = None
+    scale_sigma: float | None = None
+    slip: float | None = None
+    slip_sigma: float | None = None
+    rejected: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingStatus:
     """The status of the recording."""
 
@@ -296,6 +317,7 @@ class Status:
     nested: ClassVar[dict[str, type]] = {
         "stations": StationStatus,
         "imu": ImuStatus,
+        "odometry": OdometryStatus,
         "recording": RecordingStatus,
         "disk": DiskStatus,
     }
@@ -308,6 +330,7 @@ class Status:
     authenticated: bool | None = None
     frame_ms: float | None = None
     imu: ImuStatus | None = None
+    odometry: OdometryStatus | None = None
     recording: RecordingStatus | None = None
     disk: DiskStatus | None = None
 

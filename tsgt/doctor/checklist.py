@@ -11,6 +11,7 @@ from tsgt.doctor import computer, files, radio, serial_line
 from tsgt.doctor.finding import Finding, failed, note, ok, skipped
 from tsgt.doctor.imu import check_imu
 from tsgt.doctor.instrument import DaemonState, check_instrument
+from tsgt.doctor.odometry import check_odometry
 from tsgt.errors import TsgtError
 
 if TYPE_CHECKING:
@@ -101,6 +102,7 @@ def _master_checks(
 ) -> Iterator[tuple[str, Check]]:
     yield "setup", partial(files.check_setup, machine, config)
     yield "imu", partial(check_imu, machine, config.imu, daemon=daemon.running)
+    yield "odometry", partial(check_odometry, machine, config.odometry, daemon=daemon.running)
     yield from _common_checks(machine, path, config, service, daemon)
 
 

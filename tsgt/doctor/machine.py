@@ -61,7 +61,7 @@ class Machine:
     free_bytes : Returns the free space of a folder's disk.
     port_holder : Returns the process that has a device open; None if there is none or it is unknown.
     latency_timer_ms : Returns the latency timer of a serial adapter in ms; None without one.
-    start_imu : Starts the program that reads the IMU; None: as a child process.
+    start_imu, start_odometry : Start the programs that read the IMU and the wheel odometry; None: as a child process.
     open_port, open_hal : Open a serial line; bus and pins of a radio.
     client_status : Returns the status of the client behind a socket; None without one. Raises StreamError if it is stuck.
     serves : Whether a process serves a socket.
@@ -73,6 +73,7 @@ class Machine:
     etc: Path = Path("/etc")
     clock: Clock
     start_imu: StartProgram | None = None
+    start_odometry: StartProgram | None = None
     user: User
     find_user: Callable[[str, Sequence[str]], User | None]
     group_name: Callable[[int], str]

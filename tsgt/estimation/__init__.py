@@ -7,6 +7,7 @@ In: raw measurements and the parameters in force. Out: poses with covariance, va
 """
 
 from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, StartCheck, check_recorded_setup, start_now
+from tsgt.estimation.imu_takeover import OdometryState
 from tsgt.estimation.inertial import SampleConverter, inertial_samples
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
@@ -56,6 +57,7 @@ __all__ = [
     "LinearEstimator",
     "LiveEstimator",
     "MeasurementHistory",
+    "OdometryState",
     "PoseBatch",
     "Reason",
     "SampleConverter",

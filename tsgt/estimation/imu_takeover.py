@@ -26,12 +26,19 @@ if TYPE_CHECKING:
 
     from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.inertial import InertialSamples, WheelSamples
+    from tsgt.geometry.inertial import InertialSamples, WheelSamples, WheelsEstimate
     from tsgt.geometry.trajectory import Observations, States
     from tsgt.model import ImuParameters, ImuSamples, OdometryParameters, OdometrySamples, Vector3
+    from tsgt.recording.stream_records import OdometryUse
 
 SILENCE_S = 0.3
 """Without a sample for this long the IMU is silent. Lines of ten samples, held up by a computer under load, come sooner."""
+
+ODOMETRY_SILENCE_S = 1.0
+"""Without a sample for this long the wheel odometry is silent; nothing but the status depends on it."""
+
+MAX_REJECTED_SHARE = 0.5
+"""Share of the last seconds of wheel odometry, rejected one by one, above which it disagrees."""
 
 SOUND_S = 1.0
 """How long a silent IMU must have been heard again before its trajectory is used."""
@@ -169,6 +176,11 @@ class InertialWindow(TrajectoryWindow, Protocol):
         """Newest biases of gyro and accelerometer, (3,) each; None where unknown."""
         ...
 
+    @property
+    def wheels(self) -> WheelsEstimate | None:
+        """Newest errors of the wheel odometry; None where unknown."""
+        ...
+
     def add_samples(self, samples: InertialSamples) -> None:
         """Take samples that follow the earlier ones."""
         ...
@@ -178,6 +190,13 @@ class InertialWindow(TrajectoryWindow, Protocol):
         ...
 
 
+class OdometryState(NamedTuple):
+    """What the estimator knows of the wheel odometry: whether poses rest on it, and its newest errors; None: not estimated."""
+
+    use: OdometryUse
+    wheels: WheelsEstimate | None
+
+
 class ImuState(NamedTuple):
     """What the estimator knows of the IMU: whether poses rest on it, why it disagrees, and its biases as in the status."""
 
@@ -185,6 +204,7 @@ class ImuState(NamedTuple):
     disagreement: str
     gyro_bias_radps: Vector3 | None
     accelerometer_bias_mps2: Vector3 | None
+    odometry: OdometryState | None = None  # None without wheel odometry
 
 
 _WRONG = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
@@ -222,6 +242,7 @@ class ImuTakeover:
         self._odometry = odometry
         self._wheels: WheelConverter | None = None
         self._driven: deque[OdometrySamples] = deque()
+        self._now_s = self._driven_s = -np.inf  # Of the newest call, and of the newest sample of the wheels
         self._newest_s = self._sound_from_s = self._next_comparison_s = -np.inf
         self._contradicted_from_s = np.inf
         self._unaided_from_s: float | None = None
@@ -243,7 +264,20 @@ class ImuTakeover:
         disagreement = self._disagreement if self.use in _WRONG else ""
         if self.use == ImuUse.UNCONFIRMED and self._setup is not None:
             disagreement = self._setup.unconfirmed
-        return ImuState(self.use, disagreement, _vector(gyro), _vector(accelerometer))
+        return ImuState(self.use, disagreement, _vector(gyro), _vector(accelerometer), self._odometry_state())
+
+    def _odometry_state(self) -> OdometryState | None:
+        if self._odometry is None:
+            return None
+        wheels = self._with.wheels if self._with.converged else None
+        use: OdometryUse = "used"
+        if not self._now_s - self._driven_s <= ODOMETRY_SILENCE_S:  # Also before the first sample
+            use = "silent"
+        elif self.use != ImuUse.USED:
+            use = "without_imu"
+        elif wheels is not None and (wheels.rejected_share or 0.0) > MAX_REJECTED_SHARE:
+            use = "disagrees"
+        return OdometryState(use, wheels)
 
     @property
     def horizon_s(self) -> float:
@@ -277,7 +311,9 @@ class ImuTakeover:
     def take_samples(self) -> None:
         """Use the samples that were added."""
         if self._wheels is not None and self._driven:
-            self._with.add_odometry(self._wheels.convert(self._driven))
+            wheels = self._wheels.convert(self._driven)
+            self._with.add_odometry(wheels)
+            self._driven_s = float(wheels.end_s[-1]) if len(wheels) else self._driven_s
             self._driven.clear()
         if self._converter is None or not self._records:
             return
@@ -296,6 +332,7 @@ class ImuTakeover:
 
     def choose(self, now_s: float) -> None:
         """Choose the window for poses that are sent at a time."""
+        self._now_s = now_s
         if self.use == ImuUse.USED and now_s >= self._next_comparison_s:
             self._next_comparison_s = now_s + COMPARISON_INTERVAL_S
             self._compare(now_s)

@@ -1,4 +1,4 @@
-"""What the samples themselves show about the IMU: rate, gaps, saturation, stuck and implausible values. Sans-I/O."""
+"""What the samples themselves show about the IMU, or the wheels: rate, gaps; saturation, stuck and implausible values. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tsgt.recording import ImuStatus
 
 if TYPE_CHECKING:
     from tsgt.imu.lines import HelloLine
-    from tsgt.model import ImuSamples, Vector3
+    from tsgt.model import ImuSamples, OdometrySamples, Vector3
 
 RATE_WINDOW_NS = 10_000_000_000
 
@@ -32,11 +32,58 @@ RATE_TOLERANCE = 0.1  # of the rate in hello
 _MIN_WINDOW_NS = 5_000_000_000  # of samples, before rate and gravity are judged
 
 
+class SampleCounter:
+    """Counts samples and gaps of a device, and finds its rate; instants are on the master's Unix clock in ns."""
+
+    def __init__(self) -> None:
+        self._window: deque[tuple[int, int, int]] = (
+            deque()
+        )  # Arrival, begin and number of samples of each record
+        self.samples = self.gaps = self.lost = 0
+        self._next_sequence: int | None = None
+        self._stamp_ns: int | None = None
+
+    def program_started(self) -> None:
+        """Find the rate anew."""
+        self._window.clear()
+
+    def count(self, record: ImuSamples | OdometrySamples) -> None:
+        """Count the samples of a record."""
+        count = len(record.stamp_ns)
+        if self._next_sequence is not None and record.sequence > self._next_sequence:
+            self.gaps += 1
+            self.lost += record.sequence - self._next_sequence
+        self._next_sequence = record.sequence + count
+        self.samples += count
+        self._stamp_ns = record.stamp_ns[-1]
+        self._window.append((record.received_ns, record.stamp_ns[0] - record.duration_ns[0], count))
+        self._forget(record.received_ns)
+
+    def is_lost(self, now_ns: int) -> bool:
+        """Whether there has been no sample for too long, or none yet."""
+        return self._stamp_ns is None or now_ns - self._stamp_ns > LOSS_TIMEOUT_NS
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Return the age of the newest sample; None before the first one."""
+        return None if self._stamp_ns is None else (now_ns - self._stamp_ns) / 1e9
+
+    def rate_hz(self, now_ns: int) -> float | None:
+        """Return the samples per second of the window; None without any."""
+        self._forget(now_ns)
+        if not self._window:
+            return None
+        span_ns = max(now_ns - self._window[0][1], 1_000_000_000)
+        return sum(count for _, _, count in self._window) / (span_ns / 1e9)
+
+    def _forget(self, now_ns: int) -> None:
+        while self._window and self._window[0][0] <= now_ns - RATE_WINDOW_NS:
+            self._window.popleft()
+
+
 class _Piece(NamedTuple):
     """A record's share of the window."""
 
     received_ns: int
-    begin_ns: int
     samples: int
     duration_ns: int
     force_sum_mps2: float
@@ -51,9 +98,8 @@ class ImuMonitor:
     def __init__(self) -> None:
         self._hello: HelloLine | None = None
         self._window: deque[_Piece] = deque()
-        self._samples = self._gaps = self._lost = self._saturated = 0
-        self._next_sequence: int | None = None
-        self._stamp_ns: int | None = None
+        self._counter = SampleCounter()
+        self._saturated = 0
         self._values: tuple[Vector3, Vector3] | None = None
         self._same_ns = 0
         self._problem = ""
@@ -62,26 +108,23 @@ class ImuMonitor:
     def program_started(self, hello: HelloLine) -> None:
         """Take the identity, rate and full scale of the device."""
         self._hello = hello
+        self._counter.program_started()
         self._window.clear()
 
     def samples(self, record: ImuSamples) -> None:
         """Take a record."""
-        count = len(record.stamp_ns)
-        if self._next_sequence is not None and record.sequence > self._next_sequence:
-            self._gaps += 1
-            self._lost += record.sequence - self._next_sequence
-        self._next_sequence = record.sequence + count
-        self._samples += count
-        self._stamp_ns = record.stamp_ns[-1]
+        self._counter.count(record)
         force_sum = sum(math.hypot(*force) for force in record.specific_force_mps2)
-        begin_ns = record.stamp_ns[0] - record.duration_ns[0]
-        self._window.append(_Piece(record.received_ns, begin_ns, count, sum(record.duration_ns), force_sum))
-        self._forget(record.received_ns)
+        self._window.append(
+            _Piece(record.received_ns, len(record.stamp_ns), sum(record.duration_ns), force_sum)
+        )
+        while self._window[0].received_ns <= record.received_ns - RATE_WINDOW_NS:
+            self._window.popleft()
         self._find_problem(record)
 
     def lost(self, now_ns: int) -> bool:
         """Whether there has been no sample for too long, or none yet."""
-        return self._stamp_ns is None or now_ns - self._stamp_ns > LOSS_TIMEOUT_NS
+        return self._counter.is_lost(now_ns)
 
     def problem(self, now_ns: int) -> str:
         """Return what is wrong with the values at present, for people; empty if nothing is."""
@@ -89,28 +132,19 @@ class ImuMonitor:
 
     def status(self, now_ns: int, problem: str, clock_skew_ppm: float | None) -> ImuStatus:
         """Return the status; ``problem`` of the program precedes that of the values."""
-        self._forget(now_ns)
-        hello = self._hello
+        counter, hello = self._counter, self._hello
         name = "" if hello is None else " ".join(filter(None, (hello.make, hello.model, hello.serial_number)))
-        rate_hz = None
-        if self._window:
-            span_ns = max(now_ns - self._window[0].begin_ns, 1_000_000_000)
-            rate_hz = sum(piece.samples for piece in self._window) / (span_ns / 1e9)
         return ImuStatus(
             device=name,
-            samples=self._samples,
-            rate_hz=rate_hz,
-            age_s=None if self._stamp_ns is None else (now_ns - self._stamp_ns) / 1e9,
-            gaps=self._gaps,
-            lost=self._lost,
+            samples=counter.samples,
+            rate_hz=counter.rate_hz(now_ns),
+            age_s=counter.age_s(now_ns),
+            gaps=counter.gaps,
+            lost=counter.lost,
             saturated=self._saturated,
             clock_skew_ppm=clock_skew_ppm,
             problem=problem or self.problem(now_ns),
         )
-
-    def _forget(self, now_ns: int) -> None:
-        while self._window and self._window[0].received_ns <= now_ns - RATE_WINDOW_NS:
-            self._window.popleft()
 
     def _find_problem(self, record: ImuSamples) -> None:
         problem = self._saturation(record) or self._stuck(record) or self._implausible()

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, NoReturn
 
 import structlog
 
+from tsgt.imu.monitor import SampleCounter
 from tsgt.imu.odometry_lines import OdometryHelloLine, OdometryLine, check_speed, decode_odometry_line
 from tsgt.imu.program import CHECK_PERIOD_NS, DeviceProgram
 from tsgt.imu.sampler import DeviceSampler, RecordTimes
 from tsgt.model import OdometrySamples
+from tsgt.recording import OdometryStatus
 from tsgt.service import printable
 
 if TYPE_CHECKING:
@@ -18,8 +20,6 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.config import OdometryConfig
     from tsgt.service import StartProgram
-
-LOSS_TIMEOUT_NS = 1_000_000_000  # as for the IMU
 
 log = structlog.get_logger()
 
@@ -74,26 +74,54 @@ class WheelOdometry(DeviceProgram):
         )
         self._on_samples = on_samples
         self._on_event = on_event
-        self._newest_ns: int | None = None
+        self._counter = SampleCounter()
+        self._untrusted = 0
+        self._device = ""
         self._lost = False
 
+    def status(self) -> OdometryStatus:
+        """Return the status at present, but for what the estimator knows."""
+        now_ns, counter = self._now_ns(), self._counter
+        problem = "" if self._session is None else self._session.status.problem
+        if counter.is_lost(now_ns):
+            problem = self._problem_of_program() or "there are no samples"
+        return OdometryStatus(
+            device=self._device,
+            samples=counter.samples,
+            rate_hz=counter.rate_hz(now_ns),
+            age_s=counter.age_s(now_ns),
+            gaps=counter.gaps,
+            lost=counter.lost,
+            untrusted=self._untrusted,
+            clock_skew_ppm=self._sampler.clock_skew_ppm,
+            problem=problem,
+        )
+
     def _hello(self, hello: OdometryHelloLine) -> None:
-        name = printable(" ".join(filter(None, (hello.make, hello.model, hello.serial_number))))
-        log.info("odometry_connected", device=name, rate_hz=hello.rate_hz, clock=printable(hello.clock))
+        self._device = printable(" ".join(filter(None, (hello.make, hello.model, hello.serial_number))))
+        self._counter.program_started()
+        log.info(
+            "odometry_connected",
+            device=self._device,
+            rate_hz=hello.rate_hz,
+            clock=printable(hello.clock),
+        )
 
     def _take(self, samples: OdometrySamples) -> None:
         self._error = ""
-        self._newest_ns = samples.stamp_ns[-1]
+        self._counter.count(samples)
+        self._untrusted += samples.valid.count(False)
         self._on_samples(samples)
 
     async def _check(self) -> NoReturn:
         while True:
             await self._clock.sleep_until(self._clock.monotonic_ns() + CHECK_PERIOD_NS)
-            lost = self._newest_ns is None or self._now_ns() - self._newest_ns > LOSS_TIMEOUT_NS
+            lost = self._counter.is_lost(self._now_ns())
             if lost and not self._lost and self._overdue():
                 self._lost = True
-                problem = self._problem_of_program() or "there are no samples"
-                self._on_event("odometry_lost", f"the wheel odometry gives no samples: {problem}")
+                self._on_event(
+                    "odometry_lost", f"the wheel odometry gives no samples: {self.status().problem}"
+                )
             elif self._lost and not lost:
                 self._lost = False
                 self._on_event("odometry_recovered", "the wheel odometry gives samples again")

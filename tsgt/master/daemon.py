@@ -23,7 +23,7 @@ from tsgt.errors import RadioError, StreamError
 from tsgt.imu import Imu, WheelOdometry
 from tsgt.master.alarms import Alarms
 from tsgt.master.classic import ClassicLink
-from tsgt.master.imu_monitor import ImuUseMonitor
+from tsgt.master.imu_monitor import ImuUseMonitor, OdometryUseMonitor
 from tsgt.master.link_events import MasterEvent
 from tsgt.master.observers import GeofenceObserver, layout_monitor
 from tsgt.master.publisher import Publisher
@@ -146,6 +146,7 @@ async def run_master(
                     [
                         layout_monitor(config.frame_watch, parameters),
                         ImuUseMonitor(),
+                        OdometryUseMonitor(),
                         *(GeofenceObserver(geofence, group) for geofence in config.geofences),
                     ],
                     emit,
@@ -156,7 +157,8 @@ async def run_master(
                 link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)
                 imu = _imu(config, timeline, publisher, dependencies)
                 disk = RecordingDisk(recording, path, start_ns, dependencies.disk_status)
-                master = _Master(clock, timeline, publisher, link, imu, disk)
+                odometry = _odometry(config, timeline, publisher, dependencies)
+                master = _Master(clock, timeline, publisher, link, imu, odometry, disk)
                 log.info("master_started", recording=str(path), stations=len(config.stations))
                 service.sd_notify("READY=1")
                 group.create_task(recording.run())
@@ -171,15 +173,7 @@ async def run_master(
                     group.create_task(alarms.run())
                 if imu is not None:
                     group.create_task(imu.run())
-                if config.odometry is not None:
-                    odometry = WheelOdometry(
-                        config.odometry,
-                        clock,
-                        timeline,
-                        on_samples=publisher.odometry_samples,
-                        on_event=lambda event, message: publisher.report(MasterEvent(event, message)),
-                        start=dependencies.start_odometry,
-                    )
+                if odometry is not None:
                     group.create_task(odometry.run())
                 radio_opener = master.with_radio_events(dependencies.open_radio)
                 group.create_task(supervise_radio(radio_opener, link.run, clock))
@@ -268,6 +262,21 @@ def _imu(
     )
 
 
+def _odometry(
+    config: MasterConfig, timeline: UnixTimeline, publisher: Publisher, dependencies: MasterDependencies
+) -> WheelOdometry | None:
+    if config.odometry is None:
+        return None
+    return WheelOdometry(
+        config.odometry,
+        dependencies.clock,
+        timeline,
+        on_samples=publisher.odometry_samples,
+        on_event=lambda event, message: publisher.report(MasterEvent(event, message)),
+        start=dependencies.start_odometry,
+    )
+
+
 class _Master:
     """The tasks of the master."""
 
@@ -278,13 +287,14 @@ class _Master:
         publisher: Publisher,
         link: Link,
         imu: Imu | None,
+        odometry: WheelOdometry | None,
         disk: RecordingDisk,
     ) -> None:
         self._clock = clock
         self._timeline = timeline
         self._publisher = publisher
         self._link = link
-        self._imu = imu
+        self._imu, self._odometry = imu, odometry
         self._disk = disk
         self._radio_failed = False
 
@@ -315,6 +325,7 @@ class _Master:
                 None if self._imu is None else self._imu.status(),
                 self._disk.recording_status(),
                 self._disk.space,
+                odometry=None if self._odometry is None else self._odometry.status(),
                 realtime_ns=self._clock.realtime_ns(),
             )
             received = sum(s.last_heard_s is not None and s.last_heard_s < 5 for s in status.stations)

@@ -1,4 +1,4 @@
-"""Live events on the use of the robot's IMU: taken, left out with the cause, and predictions that moved too far. Sans-I/O."""
+"""Live events on the use of the robot's IMU and wheels: taken, left out with the cause, and predictions that moved too far. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from tsgt.master.publisher import Observer
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
-    from tsgt.recording import PoseRecord
+    from tsgt.recording import PoseRecord, StatusRecord
 
 MAX_JUMP_SIGMAS = 5.0
 """Distance by which new measurements may move a prediction, in sigmas that it stated."""
 
 JUMP_INTERVAL_NS = 10_000_000_000  # at most one event
+
+AGREED_STATUSES = 5
+"""One a second, in which wheels that disagreed must have been used again, so that wheels that spin now and then are no stream of events."""
 
 _CAUSES = {
     "starting": "its trajectory is not certain enough",
@@ -68,6 +71,34 @@ class ImuUseMonitor(Observer):
             f"{math.degrees(record.jump_rad):.2f} deg, more than {MAX_JUMP_SIGMAS:g} sigmas"
         )
         return [EventRecord(stamp_ns=now_ns, event="pose_jump", message=message)]
+
+
+class OdometryUseMonitor(Observer):
+    """Watches in the status whether the wheel odometry disagrees with IMU and prisms."""
+
+    def __init__(self) -> None:
+        self._disagrees = False
+        self._agreed = 0  # Successive statuses in which it was used again
+
+    def status(self, record: StatusRecord) -> list[EventRecord]:
+        """Take a status; return ``odometry_disagrees`` and ``odometry_agrees``."""
+        use = None if record.odometry is None else record.odometry.use
+        if use == "disagrees":
+            self._agreed = 0
+            if not self._disagrees:
+                self._disagrees = True
+                message = (
+                    "the wheel odometry disagrees with IMU and prisms and hardly counts: wheels spin, stick or are lifted, "
+                    "or its scale, direction or latency is wrong"
+                )
+                return [EventRecord(stamp_ns=record.stamp_ns, event="odometry_disagrees", message=message)]
+        elif self._disagrees and use == "used":
+            self._agreed += 1
+            if self._agreed == AGREED_STATUSES:
+                self._disagrees, self._agreed = False, 0
+                message = "the wheel odometry agrees with IMU and prisms again"
+                return [EventRecord(stamp_ns=record.stamp_ns, event="odometry_agrees", message=message)]
+        return []
 
 
 def _contradiction(station: int, now_ns: int) -> EventRecord:

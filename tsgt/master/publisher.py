@@ -18,7 +18,7 @@ from tsgt.recording import EventRecord, PoseRecord, encode_line
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from tsgt.estimation import StartCheck
+    from tsgt.estimation import OdometryState, StartCheck
     from tsgt.master.station_events import StationEventDetector
     from tsgt.master.statistics import Statistics
     from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         ClockRecord,
         DiskStatus,
         ImuStatus,
+        OdometryStatus,
         RecordingStatus,
         SetupRecord,
         StatusRecord,
@@ -38,6 +39,10 @@ class Observer:
 
     def pose(self, _record: PoseRecord, _now_ns: int, /) -> Sequence[EventRecord]:
         """Take a pose that was published at an instant."""
+        return ()
+
+    def status(self, _record: StatusRecord, /) -> Sequence[EventRecord]:
+        """Take a status."""
         return ()
 
     def measurement(self, _record: Measurement, /) -> Sequence[EventRecord]:
@@ -126,6 +131,7 @@ class Publisher:
         recording: RecordingStatus | None = None,
         disk: DiskStatus | None = None,
         *,
+        odometry: OdometryStatus | None = None,
         realtime_ns: int,
     ) -> StatusRecord:
         """Publish the events of expired time-outs and a status record; ``realtime_ns`` is the machine's Unix clock."""
@@ -140,8 +146,12 @@ class Publisher:
                 gyro_bias_radps=state.gyro_bias_radps,
                 accelerometer_bias_mps2=state.accelerometer_bias_mps2,
             )
-        status = self._statistics.status(now_ns, link, imu, recording, disk)
+        if odometry is not None and state is not None and state.odometry is not None:
+            odometry = _with_estimate(odometry, state.odometry)
+        status = self._statistics.status(now_ns, link, imu, recording, disk, odometry=odometry)
         self.put(status)
+        for observer in self._observers:
+            self._put_all(observer.status(status))
         return status
 
     def measurement(self, measurement: Measurement) -> None:
@@ -202,3 +212,18 @@ class Publisher:
             self._statistics.outside_lag_window(outside_lag_window)
         self._put_all(events)
         self._changed.set()
+
+
+def _with_estimate(status: OdometryStatus, state: OdometryState) -> OdometryStatus:
+    """Return the status with what the estimator knows."""
+    if (wheels := state.wheels) is None:
+        return replace(status, use=state.use)
+    return replace(
+        status,
+        use=state.use,
+        scale=float(wheels.values[0]),
+        scale_sigma=float(wheels.sigmas[0]),
+        slip=float(wheels.values[1]),
+        slip_sigma=float(wheels.sigmas[1]),
+        rejected=wheels.rejected_share,
+    )

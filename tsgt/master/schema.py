@@ -43,6 +43,7 @@ PAGES: dict[Path, tuple[type, ...]] = {
         recording.StatusRecord,
         recording.StationStatus,
         recording.ImuStatus,
+        recording.OdometryStatus,
         recording.RecordingStatus,
         recording.DiskStatus,
         recording.EventRecord,

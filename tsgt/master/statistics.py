@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from tsgt.master.link_events import LinkStatus, SuperframeState
     from tsgt.model import Measurement
-    from tsgt.recording import DiskStatus, ImuStatus, RecordingStatus
+    from tsgt.recording import DiskStatus, ImuStatus, OdometryStatus, RecordingStatus
     from tsgt.timesync.two_way import ClockEstimate
 
 RATE_WINDOW_NS = 10_000_000_000
@@ -87,6 +87,7 @@ class Statistics:
         imu: ImuStatus | None = None,
         recording: RecordingStatus | None = None,
         disk: DiskStatus | None = None,
+        odometry: OdometryStatus | None = None,
     ) -> StatusRecord:
         """Return the status at an instant on the master's Unix clock."""
         stations = (
@@ -102,6 +103,7 @@ class Statistics:
             authenticated=link.authenticated,
             frame_ms=link.frame_ms,
             imu=imu,
+            odometry=odometry,
             recording=recording,
             disk=disk,
         )

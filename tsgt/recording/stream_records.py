@@ -39,6 +39,7 @@ Degradation = Literal[
     "prism_missing", "old_measurements", "uncertain", "ambiguous", "residual", "imu_unconfirmed"
 ]
 ImuUse = Literal["used", "starting", "silent", "disagrees", "wrong_setup", "unconfirmed"]
+OdometryUse = Literal["used", "silent", "disagrees", "without_imu"]
 
 CONTINUOUS_PROMISE = (
     "The sigmas that the pose states, of position at the reference point and of rotation, each in its least certain "
@@ -57,6 +58,7 @@ PositionOrNone = Vector3 | None
 QuaternionOrNone = Row4 | None
 CovarianceOrNone = Annotated[tuple[float, ...], Field(min_length=36, max_length=36)] | None
 ImuUseOrNone = ImuUse | None
+OdometryUseOrNone = OdometryUse | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -327,6 +329,61 @@ class ImuStatus(FiniteNumbers):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OdometryStatus(FiniteNumbers):
+    """The status of the robot's wheel odometry."""
+
+    device: str
+    """Maker, model and serial number, as its program reports them; empty before it has."""
+    samples: int
+    """Samples since the master started."""
+    rate_hz: float | None
+    """Samples per second over the last ten seconds; null without any."""
+    age_s: float | None
+    """Age of the newest sample in s; null before the first one."""
+    gaps: int
+    """How often samples were missing since the master started."""
+    lost: int
+    """How many samples were missing."""
+    untrusted: int
+    """Samples that the device did not trust."""
+    clock_skew_ppm: float | None
+    """Skew of this computer's clock against the device's, as for the IMU."""
+    problem: str
+    """What is wrong with the device or its program, for people; empty when nothing is."""
+    use: OdometryUseOrNone = None
+    """Whether poses rest on it now: ``used``; ``silent``: no sample for 1 s; ``disagrees``: with IMU and prisms, in most of the last
+    seconds, so that it hardly counts; ``without_imu``: poses do not rest on the IMU, and wheels are used beside it. Null where the
+    estimator does not tell."""
+    scale: float | None = None
+    """Estimated relative error of the speed that stays: the true speed is 1 + ``scale`` + ``slip`` times the measured one; null
+    while it is not estimated."""
+    scale_sigma: float | None = None
+    """One sigma of it."""
+    slip: float | None = None
+    """Estimated relative error of the speed now, which comes and goes; null while it is not estimated."""
+    slip_sigma: float | None = None
+    """One sigma of it."""
+    rejected: float | None = None
+    """Share of the last four seconds of samples that contradict IMU and prisms, 0 to 1; null without samples there."""
+
+    def figures(self) -> list[str]:
+        """Return rate and losses, what is wrong, and what the estimator knows, each in words."""
+        parts = [] if self.rate_hz is None else [f"{self.rate_hz:.1f} Hz"]
+        parts.append(f"{self.gaps} gaps ({self.lost} samples lost)")
+        if self.untrusted:
+            parts.append(f"{self.untrusted} untrusted")
+        if self.use is not None:
+            parts.append(self.use.replace("_", " "))
+        if self.scale is not None and self.scale_sigma is not None:
+            parts.append(f"scale {100 * self.scale:+.2f} +/- {100 * self.scale_sigma:.2f} %")
+        if self.slip is not None and self.slip_sigma is not None:
+            parts.append(f"slip {100 * self.slip:+.1f} +/- {100 * self.slip_sigma:.1f} %")
+        if self.rejected:
+            parts.append(f"{100 * self.rejected:.0f} % rejected")
+        return parts + ([self.problem] if self.problem else [])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingStatus(FiniteNumbers):
     """The status of the recording."""
 
@@ -353,6 +410,7 @@ class DiskStatus(FiniteNumbers):
 
 
 ImuStatusOrNone = ImuStatus | None
+OdometryStatusOrNone = OdometryStatus | None
 RecordingStatusOrNone = RecordingStatus | None
 DiskStatusOrNone = DiskStatus | None
 
@@ -361,7 +419,7 @@ DiskStatusOrNone = DiskStatus | None
 class StatusRecord(FiniteNumbers):
     """The status of the master and its stations, about once per second."""
 
-    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu"})
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu", "odometry"})
 
     type: Literal["status"] = "status"
     stamp_ns: int
@@ -380,6 +438,8 @@ class StatusRecord(FiniteNumbers):
     """Mean duration of the last frames, from beacon to beacon, in ms; null with ``classic``."""
     imu: ImuStatusOrNone = None
     """Status of the robot's IMU; absent where none is configured."""
+    odometry: OdometryStatusOrNone = None
+    """Status of the robot's wheel odometry; absent where none is configured."""
     recording: RecordingStatusOrNone = None
     """Status of the recording; null in recordings of older versions."""
     disk: DiskStatusOrNone = None

@@ -1,4 +1,4 @@
-"""What the records say that the operator has to know: pose, fences, storage, stations, IMU, lasting events. Sans-I/O."""
+"""What the records say that the operator has to know: pose, fences, storage, stations, IMU, wheels, lasting events. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _END = {
 _GOOD_NEWS = frozenset(
     {
         "station_recovered", "station_measuring", "station_tracking", "radio_recovered", "imu_setup_confirmed",
-        "imu_recovered", "imu_plausible", "imu_used", "geofence_entered", "layout_residual_normal",
+        "imu_recovered", "imu_plausible", "imu_used", "odometry_recovered", "odometry_agrees", "geofence_entered", "layout_residual_normal",
     }
 )  # fmt: skip
 
@@ -255,6 +255,35 @@ def imu_view(status: StatusRecord | None) -> dict[str, Any] | None:
     if imu is None:
         return None
     return {"device": imu.device[:60], "use": imu.use, "rate_hz": imu.rate_hz, "problem": imu.problem[:200]}
+
+
+def odometry_findings(status: StatusRecord | None) -> list[Finding]:
+    """Return what is wrong with the robot's wheel odometry."""
+    odometry = status.odometry if status is not None else None
+    if odometry is None:
+        return []
+    if odometry.age_s is None or odometry.age_s > MAX_IMU_AGE_S:
+        return [Finding(Level.CARE, "the wheel odometry gives no samples")]
+    if odometry.problem:
+        return [Finding(Level.CARE, f"wheel odometry: {odometry.problem}")]
+    if odometry.use == "disagrees":
+        return [Finding(Level.CARE, "the wheel odometry disagrees with IMU and prisms")]
+    return []
+
+
+def odometry_view(status: StatusRecord | None) -> dict[str, Any] | None:
+    """Return what the page shows of the wheel odometry; None without one."""
+    odometry = status.odometry if status is not None else None
+    if odometry is None:
+        return None
+    return {
+        "device": odometry.device[:60],
+        "use": odometry.use,
+        "rate_hz": odometry.rate_hz,
+        "problem": odometry.problem[:200],
+        "slip": odometry.slip,
+        "rejected": odometry.rejected,
+    }
 
 
 def radio_view(status: StatusRecord | None, setup: SetupRecord | None) -> dict[str, Any]:

@@ -241,6 +241,7 @@ class MissionState:
             else {},
             "stations": self._tiles(now_s) if live else self._silent_tiles(),
             "imu": findings.imu_view(self._status) if live else None,
+            "odometry": findings.odometry_view(self._status) if live else None,
             "radio": findings.radio_view(self._status, self._setup) if live else None,
             **(findings.storage_view(self._status, self._setup) if live else {}),
         }
@@ -294,6 +295,7 @@ class MissionState:
             *self._standing.findings(),
             *findings.station_findings(self._status, conditions),
             *findings.imu_findings(self._status),
+            *findings.odometry_findings(self._status),
         ]
         return judge(stream, facts, findings.waiting_for(conditions), _without_repetition(others))
 

@@ -7,7 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.records import CLOCK, EVENT, IMU_STATUS, PARAMETERS, POSE, SETUP, STATUS, measurement
+from harness.records import (
+    CLOCK,
+    EVENT,
+    IMU_STATUS,
+    ODOMETRY_STATUS,
+    PARAMETERS,
+    POSE,
+    SETUP,
+    STATUS,
+    measurement,
+)
 from scipy.spatial.transform import Rotation
 
 from tsgt.cli.render import render, yaw_pitch_roll_deg
@@ -119,6 +129,16 @@ def test_status_text_has_the_imu() -> None:
     assert text.endswith(
         "; IMU: 2000 samples, 199.9 Hz, 1 gaps (3 samples lost), 0 saturated, clock -12.5 ppm, disagrees, "
         "the gyro and the prisms disagree, last 0.04 s ago"
+    )
+
+
+def test_status_text_has_the_wheels() -> None:
+    """Scale, slip and what is rejected in percent."""
+    text = render("status", encode_line(replace(STATUS, odometry=ODOMETRY_STATUS)))
+    assert text is not None
+    assert text.endswith(
+        "; wheel odometry: 400 samples, 20.0 Hz, 1 gaps (2 samples lost), 3 untrusted, used, scale +1.25 +/- 0.20 %, "
+        "slip -2.1 +/- 1.2 %, 25 % rejected, last 0.08 s ago"
     )
 
 

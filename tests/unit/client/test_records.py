@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness.records import EVENT, HELLO, IMU_STATUS, NO_POSE, POSE, SETUP, STATUS
+from harness.records import EVENT, HELLO, IMU_STATUS, NO_POSE, ODOMETRY_STATUS, POSE, SETUP, STATUS
 
 from tsgt.client import PROTOCOL_VERSION, Pose, records
 from tsgt.client.build import TYPES, build, load
@@ -30,6 +30,7 @@ CLASSES = {
     "StatusRecord": records.Status,
     "StationStatus": records.StationStatus,
     "ImuStatus": records.ImuStatus,
+    "OdometryStatus": records.OdometryStatus,
     "EventRecord": records.Event,
     "SetupRecord": records.Setup,
     "SetupStation": records.SetupStation,
@@ -81,7 +82,8 @@ def _annotation(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "record", [POSE, NO_POSE, HELLO, SETUP, STATUS, replace(STATUS, imu=IMU_STATUS), EVENT]
+    "record",
+    [POSE, NO_POSE, HELLO, SETUP, STATUS, replace(STATUS, imu=IMU_STATUS, odometry=ODOMETRY_STATUS), EVENT],
 )
 def test_every_value_arrives(record: Any) -> None:
     """What the master encodes is what the client's record has, to the last bit."""

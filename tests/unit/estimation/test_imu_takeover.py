@@ -14,16 +14,24 @@ from harness.scene import SECOND, START, Scene, driving, stationary_scene
 
 from tsgt.estimation import LiveEstimator, imu_setup_monitor
 from tsgt.estimation.continuous import ContinuousEstimator
-from tsgt.estimation.imu_takeover import PROVEN_S, QUARANTINE_S, SILENCE_S, SOUND_S, UNAIDED_S, ImuTakeover
+from tsgt.estimation.imu_takeover import (
+    PROVEN_S,
+    QUARANTINE_S,
+    SILENCE_S,
+    SOUND_S,
+    UNAIDED_S,
+    ImuState,
+    ImuTakeover,
+)
 from tsgt.estimation.pose_batch import ImuUse
+from tsgt.geometry.inertial import WheelsEstimate
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.geometry.trajectory import FixedLagSmoother
-from tsgt.model import ImuSamples, Measurement
+from tsgt.model import ImuSamples, Measurement, OdometryParameters, OdometrySamples
 from tsgt.recording import PoseRecord, encode_line
 
 if TYPE_CHECKING:
-    from tsgt.estimation.imu_takeover import ImuState
-    from tsgt.geometry.inertial import InertialSamples
+    from tsgt.geometry.inertial import InertialSamples, WheelSamples
     from tsgt.model import ImuParameters, MotionPrior
 
 LINE_S = 0.05
@@ -42,6 +50,7 @@ class FakeInertialSmoother(FixedLagSmoother):
         self.health: str | None = None
         self.setup_in_doubt = False
         self.contradicted = False
+        self.wheels: WheelsEstimate | None = None
         self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
         self.samples: list[InertialSamples] = []
         self.created.append(self)
@@ -49,6 +58,9 @@ class FakeInertialSmoother(FixedLagSmoother):
     def add_samples(self, samples: InertialSamples) -> None:
         """Keep samples."""
         self.samples.append(samples)
+
+    def add_odometry(self, _: WheelSamples) -> None:
+        """Use none."""
 
     def predict(self, time_s: float, *, dim: int = 18) -> Any:
         """Predict as without IMU, but higher."""
@@ -173,7 +185,7 @@ def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any],
         found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
         poses += predicted(list(found))
         states.append(live.imu_state())
-    assert states[-1] == (ImuUse.USED, "", (0.001, 0.002, -0.003), (0.01, -0.02, 0.03))
+    assert states[-1] == ImuState(ImuUse.USED, "", (0.001, 0.002, -0.003), (0.01, -0.02, 0.03))
     assert any(state.use == ImuUse.DISAGREES and cause in state.disagreement for state in states if state)
     _, _, (disagrees, from_s), (used, until_s) = uses_from(poses)
     assert (disagrees, used) == ("disagrees", "used")
@@ -413,3 +425,42 @@ def test_smoother_gets_all_samples_from_before_its_measurements_on(scene: Scene)
     end_s = np.concatenate([each.end_s for each in FakeInertialSmoother.created[0].samples])
     assert np.diff(end_s) == pytest.approx(0.005, abs=1e-9)
     assert end_s[0] < 0.0
+
+
+@pytest.mark.parametrize(("rejected_s", "use"), [(1.9, "used"), (2.1, "disagrees")])
+def test_use_of_wheels_is_known(scene: Scene, rejected_s: float, use: str) -> None:
+    """They are silent a second after the last sample, and without IMU there is none."""
+    parameters = replace(scene.parameters, odometry=OdometryParameters())
+    live = LiveEstimator(parameters, lambda _work: lambda: RIGHT)
+    words: list[tuple[str, float]] = []
+    for each in arrivals(scene, 6.0, silent=(3.5, np.inf)):
+        if isinstance(each, ImuSamples):
+            live.imu_samples(each)
+            if each.received_ns < START + 2 * SECOND:
+                live.odometry_samples(wheels_beside(each))
+        else:
+            live.measurement(each)
+        wheels = WheelsEstimate(np.zeros(3), np.ones(3), 4.0, rejected_s)
+        FakeInertialSmoother.created[0].wheels = wheels
+        state = live.imu_state()
+        assert state is not None
+        assert state.odometry is not None
+        if not words or words[-1][0] != state.odometry.use:
+            words.append((state.odometry.use, (each.received_ns - START) / SECOND))
+    assert [word for word, _ in words] == ["silent", "without_imu", use, "silent"]
+    assert words[-1][1] == pytest.approx(3.0, abs=0.1)
+    assert live.imu_state() is not None
+
+
+def wheels_beside(samples: ImuSamples) -> OdometrySamples:
+    """Return one sample of wheel odometry that ends with a line of the IMU."""
+    return OdometrySamples(
+        sequence=samples.sequence // 10,
+        received_ns=samples.received_ns,
+        stamp_ns=samples.stamp_ns[-1:],
+        duration_ns=(50_000_000,),
+        instrument_time_ns=None,
+        speed_mps=(0.5,),
+        yaw_rate_radps=None,
+        valid=(True,),
+    )

@@ -70,6 +70,38 @@ def test_distances_become_speeds_with_times() -> None:
     assert events == ["odometry_lost"]
 
 
+def test_slow_counter_without_a_clock_is_not_restarted() -> None:
+    """Its clock is fitted after two seconds, which are as long as the program may be without a usable sample."""
+    records: list[Any] = []
+    starts: list[int] = []
+
+    async def main() -> None:
+        clock = VirtualClock(START_NS)
+        start = FakeStart(clock, HELLO | {"rate_hz": 10.0})
+        odometry = WheelOdometry(
+            OdometryConfig(command=("odometry-program",)),
+            clock,
+            UnixTimeline(10**18),
+            on_samples=records.append,
+            on_event=lambda _event, _message: None,
+            start=start,
+        )
+        task = asyncio.create_task(odometry.run())
+        await asyncio.sleep(0.01)
+        for number in range(50):
+            await asyncio.sleep(0.1)
+            start.programs[-1].print_lines({"type": "samples", "counter": [number], "speed_mps": [0.0]})
+        starts.append(len(start.programs))
+        assert odometry.status().rate_hz == pytest.approx(10.0, abs=0.3)
+        assert odometry.status().problem == ""
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    run_virtual(main)
+    assert starts == [1]
+    assert sum(len(record.stamp_ns) for record in records) == 50
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

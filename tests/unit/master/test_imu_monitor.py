@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from harness.records import POSE, SECOND, START
+from harness.records import ODOMETRY_STATUS, POSE, SECOND, START, STATUS
 
-from tsgt.master.imu_monitor import JUMP_INTERVAL_NS, ImuUseMonitor
+from tsgt.master.imu_monitor import AGREED_STATUSES, JUMP_INTERVAL_NS, ImuUseMonitor, OdometryUseMonitor
 
 PREDICTED = replace(POSE, kind="predicted", estimator="continuous", imu="used")
 SIGMA = 1e-3  # of POSE, per axis
@@ -75,3 +75,24 @@ def test_jump_beyond_the_stated_sigma_is_an_event() -> None:
     assert monitor.pose(far, START + JUMP_INTERVAL_NS)
     monitor.pose(replace(PREDICTED, covariance=None), START)
     assert not monitor.pose(far, START + 3 * JUMP_INTERVAL_NS)
+
+
+def test_wheels_that_disagree_are_an_event_until_they_have_agreed_for_a_while() -> None:
+    """Neither their loss nor that of the IMU counts as agreement."""
+    monitor = OdometryUseMonitor()
+    uses = [
+        "used",
+        "disagrees",
+        "used",
+        "disagrees",
+        "silent",
+        "without_imu",
+        *["used"] * (AGREED_STATUSES + 2),
+    ]
+    events = [
+        (second, event.event)
+        for second, use in enumerate(uses)
+        for event in monitor.status(replace(STATUS, odometry=replace(ODOMETRY_STATUS, use=use)))  # type: ignore[arg-type]
+    ]
+    assert events == [(1, "odometry_disagrees"), (5 + AGREED_STATUSES, "odometry_agrees")]
+    assert monitor.status(STATUS) == []

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from harness.records import SETUP, START, measurement
+from harness.records import ODOMETRY_STATUS, SETUP, START, measurement
 from harness.web import feed, mission, pose, station, status
 
 from tsgt.model import ReferencePoint, Status
@@ -158,6 +158,24 @@ def test_trouble_with_the_recording_is_told(
     assert verdict(state, 10.1) == (
         ("CARE", cause) if cause else ("GOOD", "all stations track, the pose is valid")
     )
+
+
+@pytest.mark.parametrize(
+    ("changes", "cause"),
+    [
+        ({"age_s": 4.0}, "the wheel odometry gives no samples"),
+        ({"problem": "no encoder"}, "wheel odometry: no encoder"),
+        ({"use": "disagrees"}, "the wheel odometry disagrees with IMU and prisms"),
+    ],
+)
+def test_trouble_with_the_wheels_is_told(changes: dict[str, Any], cause: str) -> None:
+    """Sound ones are a fact."""
+    state = mission()
+    feed(state, status(10.0, odometry=ODOMETRY_STATUS), pose(10.0), now_s=10.0)
+    assert verdict(state, 10.1)[0] == "GOOD"
+    assert state.view(10.1)["odometry"]["slip"] == ODOMETRY_STATUS.slip
+    feed(state, status(10.5, odometry=replace(ODOMETRY_STATUS, **changes)), now_s=10.5)
+    assert verdict(state, 10.6) == ("CARE", cause)
 
 
 def test_heading_and_prisms_are_those_of_the_robot() -> None:

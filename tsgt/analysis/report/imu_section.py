@@ -1,4 +1,4 @@
-"""Report section on the robot's IMU: samples, biases, and the gyro against the prisms."""
+"""Report section on the robot's IMU: samples, biases, the gyro against the prisms, and the wheel odometry."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.estimation import PoseBatch
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.inertial import WheelsFit
 
 TITLE = "IMU of the robot"
 
 INTERVAL_NS = 1_000_000_000  # Over which rotations are compared
+MAX_REJECTED_SHARE = 0.1  # Of the time of wheel odometry, above which the report says what may be wrong
 GAP = 1.5  # Durations of a sample; a longer interval lacks some
 
 
@@ -78,6 +80,10 @@ def imu_section(f: Findings, axis: TimeAxis) -> Section | None:
         ("bias of the accelerometer, x, y, z (m/s^2)", _triple(numbers["accelerometer_bias_mps2"])),
         ("one sigma of it", _triple(numbers["accelerometer_bias_sigma_mps2"], 4)),
     ]
+    tables = [Table("Samples and biases", (), tuple(rows))]
+    if imu.fit.wheels is not None:
+        text.append(_wheels_text(numbers["odometry"]))
+        tables.append(_wheels_table(numbers["odometry"], f))
     plot = ReportFigure(
         "imu_biases",
         "Biases of the IMU",
@@ -86,7 +92,31 @@ def imu_section(f: Findings, axis: TimeAxis) -> Section | None:
         panels_height_mm(2),
         lambda figure: draw_biases(figure, biases, axis),
     )
-    return Section(TITLE, tuple(text), (Table("Samples and biases", (), tuple(rows)),), (plot,))
+    return Section(TITLE, tuple(text), tuple(tables), (plot,))
+
+
+def _wheels_text(numbers: dict[str, Any]) -> str:
+    text = (
+        "The wheel odometry was used: the true speed was 1 + scale + slip times the measured one. "
+        f"{format_number(100 * numbers['rejected'])} % of the time it contradicted IMU and prisms, and hardly counted."
+    )
+    if numbers["rejected"] > MAX_REJECTED_SHARE:
+        text += " That is much: wheels spun or were lifted, or the point, direction, scale or latency of the odometry is wrong."
+    return text
+
+
+def _wheels_table(numbers: dict[str, Any], f: Findings) -> Table:
+    log = f.log.odometry
+    rows = [
+        ("samples", str(numbers["samples"])),
+        *([] if log is None else [("gaps", f"{log.gaps}, {log.lost} samples lost")]),
+        ("time with samples", f"{format_number(100 * numbers['covered'])} %"),
+        ("scale", f"{100 * numbers['scale']:+.2f} +/- {100 * numbers['scale_sigma']:.2f} %"),
+        ("slip, root mean square", f"{format_number(100 * numbers['slip_rms'])} %"),
+        ("slip, largest", f"{format_number(100 * numbers['slip_max'])} %"),
+        ("rejected", f"{format_number(100 * numbers['rejected'])} %"),
+    ]
+    return Table("Wheel odometry", (), tuple(rows))
 
 
 def imu_numbers(f: Findings) -> dict[str, Any]:
@@ -109,7 +139,25 @@ def imu_numbers(f: Findings) -> dict[str, Any]:
         "gyro_bias_sigma_dps": sigma[:3].tolist(),
         "accelerometer_bias_mps2": middle[3:].tolist(),
         "accelerometer_bias_sigma_mps2": sigma[3:].tolist(),
+        **({} if imu.fit.wheels is None else {"odometry": odometry_numbers(imu, imu.fit.wheels)}),
         "rotation_innovation_deg": None if f.linear is None else rotation_innovation(continuous, f.linear),
+    }
+
+
+def odometry_numbers(imu: ImuUse, wheels: WheelsFit) -> dict[str, Any]:
+    """Return the numbers of wheel odometry that was used; shares are of the time, scale and slip relative."""
+    knots = imu.fit.trajectory.knots
+    step_s = np.diff(knots.time_s)
+    covered_s = step_s[wheels.covered].sum()
+    slip = knots.wheels[:, 1]
+    return {
+        "samples": imu.odometry_samples,
+        "covered": float(covered_s / step_s.sum()),
+        "scale": float(np.median(knots.wheels[:, 0])),
+        "scale_sigma": float(np.median(wheels.sigmas[:, 0])),
+        "slip_rms": float(np.sqrt((slip**2).mean())),
+        "slip_max": float(np.abs(slip).max()),
+        "rejected": float(step_s[wheels.covered & wheels.rejected].sum() / max(covered_s, 1e-9)),
     }
 
 

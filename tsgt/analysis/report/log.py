@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from tsgt.errors import RecordingError
-from tsgt.recording import ImuStatus
+from tsgt.recording import ImuStatus, OdometryStatus
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry import FloatArray
+
+_S = TypeVar("_S", ImuStatus, OdometryStatus)
 
 _TYPES = (b'"status"', b'"clock"', b'"event"')
 
@@ -58,7 +60,7 @@ class Log:
     """Records of a recording other than measurements and poses.
 
     ``radio`` and ``clocks`` are by station, ``events`` are (stamp_ns, message) in the order of the file, ``protocol`` and
-    ``authenticated`` are those of the last status (None without a radio), as is ``imu`` (None without an IMU).
+    ``authenticated`` are those of the last status (None without a radio), as are ``imu`` and ``odometry`` (None without).
     """
 
     radio: dict[int, RadioSeries]
@@ -67,6 +69,7 @@ class Log:
     protocol: str | None
     authenticated: bool | None
     imu: ImuStatus | None = None
+    odometry: OdometryStatus | None = None
 
 
 def read_log(path: Path) -> Log:
@@ -100,7 +103,8 @@ def read_log(path: Path) -> Log:
         events=tuple(events),
         protocol=last.get("protocol"),
         authenticated=last.get("authenticated"),
-        imu=_imu(last.get("imu")),
+        imu=_device(ImuStatus, last.get("imu")),
+        odometry=_device(OdometryStatus, last.get("odometry")),
     )
 
 
@@ -112,9 +116,9 @@ def _parsed(raw: bytes) -> dict[str, Any]:
     return record if isinstance(record, dict) and isinstance(record.get("stamp_ns"), int) else {}
 
 
-def _imu(status: object) -> ImuStatus | None:
+def _device(cls: type[_S], status: object) -> _S | None:
     try:
-        return None if status is None else TypeAdapter(ImuStatus).validate_python(status)
+        return None if status is None else TypeAdapter(cls).validate_python(status)
     except ValidationError:
         return None
 

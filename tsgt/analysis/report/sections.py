@@ -79,6 +79,11 @@ def _recording(f: Findings) -> Section:
         ("measurements", f"{sum(e.measurements for e in f.station_statistics.values())}"),
         ("radio protocol", f.log.protocol or UNKNOWN),
         *([] if f.log.imu is None else [("IMU", ", ".join([f.log.imu.device, *f.log.imu.figures()]))]),
+        *(
+            []
+            if f.log.odometry is None
+            else [("wheel odometry", ", ".join([f.log.odometry.device, *f.log.odometry.figures()]))]
+        ),
         ("events recorded", f"{len(f.log.events)}"),
     ]
     tables = [Table("", (), tuple(rows))]

@@ -14,7 +14,14 @@ from tsgt.cli.render import clock_time
 from tsgt.model import Status
 
 if TYPE_CHECKING:
-    from tsgt.recording import DiskStatus, ImuStatus, RecordingStatus, StationStatus, StatusRecord
+    from tsgt.recording import (
+        DiskStatus,
+        ImuStatus,
+        OdometryStatus,
+        RecordingStatus,
+        StationStatus,
+        StatusRecord,
+    )
     from tsgt.recording.journal import InstrumentRecord
     from tsgt.station import ClientStatus
 
@@ -68,7 +75,7 @@ def master_text(record: StatusRecord) -> tuple[list[str], bool]:
 
 
 def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:
-    """Return stations, IMU and recording of a master's status, and what requires action, the most urgent first."""
+    """Return stations, IMU, wheels and recording of a master's status, and what requires action, the most urgent first."""
     blocks, problems = [], []
     for station in record.stations:
         label, ok = station_label(station)
@@ -78,6 +85,10 @@ def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:
         label, ok = imu_label(record.imu)
         blocks.append([_headline(f"IMU  {label}", ok=ok), *_imu_lines(record.imu)])
         problems += [] if ok else [f"IMU: {label}"]
+    if record.odometry is not None:
+        label, ok = odometry_label(record.odometry)
+        blocks.append([_headline(f"WHEELS  {label}", ok=ok), *_odometry_lines(record.odometry)])
+        problems += [] if ok else [f"wheel odometry: {label}"]
     if record.recording is not None:
         block, ok = _recording_block(record.recording, record.disk, record.stamp_ns)
         blocks.append(block)
@@ -144,6 +155,36 @@ def _imu_lines(imu: ImuStatus) -> list[str]:
     for text in (imu.problem, imu.disagreement):
         lines += wrapped(text, "  ")
     return [line for line in lines if line.strip()]
+
+
+def odometry_label(odometry: OdometryStatus) -> tuple[str, bool]:
+    """Return the state of the wheel odometry in a word or two, and whether no action is required."""
+    if odometry.age_s is None:
+        return "NO SAMPLES YET", False
+    if odometry.age_s > MAX_IMU_AGE_S:
+        return f"SILENT {duration(odometry.age_s)}", False
+    if odometry.problem:
+        return "CHECK THEM", False
+    if odometry.use == "disagrees":
+        return "DISAGREE WITH IMU AND PRISMS", False
+    return ("NOT IN USE: NO IMU" if odometry.use == "without_imu" else "OK"), True
+
+
+def _odometry_lines(odometry: OdometryStatus) -> list[str]:
+    rate = "" if odometry.rate_hz is None else f"{odometry.rate_hz:.1f} Hz  "
+    age = "" if odometry.age_s is None else f"last {duration(odometry.age_s)}"
+    lines = [*wrapped(odometry.device, "  "), f"  {rate}{age}".rstrip()]
+    if odometry.gaps:
+        lines.append(f"  {odometry.gaps} gaps, {odometry.lost} samples lost")
+    if odometry.untrusted:
+        lines.append(f"  {odometry.untrusted} untrusted samples")
+    if odometry.scale is not None and odometry.scale_sigma is not None:
+        lines.append(f"  scale {100 * odometry.scale:+.2f} +/- {100 * odometry.scale_sigma:.2f} %")
+    if odometry.slip is not None and odometry.slip_sigma is not None:
+        lines.append(f"  slip {100 * odometry.slip:+.1f} +/- {100 * odometry.slip_sigma:.1f} %")
+    if odometry.rejected:
+        lines.append(f"  {100 * odometry.rejected:.0f} % rejected")
+    return [line for line in [*lines, *wrapped(odometry.problem, "  ")] if line.strip()]
 
 
 def station_label(station: StationStatus) -> tuple[str, bool]:

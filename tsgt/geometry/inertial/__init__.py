@@ -8,12 +8,13 @@ from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
 from tsgt.geometry.inertial.fixed_lag import InertialFixedLagSmoother, WindowTrajectory
 from tsgt.geometry.inertial.health import DISAGREES_WITH_PRISMS, sound_samples
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
-from tsgt.geometry.inertial.odometry import Odometry, WheelSamples
+from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
 from tsgt.geometry.inertial.smoother import (
     InertialFit,
+    WheelsFit,
     estimation_noise,
     find_start,
     fit_inertial_trajectory,
@@ -54,6 +55,8 @@ __all__ = [
     "Odometry",
     "Preintegrated",
     "WheelSamples",
+    "WheelsEstimate",
+    "WheelsFit",
     "WindowTrajectory",
     "anchor_at_end",
     "concatenate_inertial_states",

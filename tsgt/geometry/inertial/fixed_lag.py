@@ -23,7 +23,7 @@ from tsgt.geometry.inertial.factors import (
 )
 from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
-from tsgt.geometry.inertial.odometry import Odometry, WheelSamples
+from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
@@ -82,6 +82,7 @@ CONSISTENT_ALONE = 5
 """Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
 each of them. A chance agreement of wrong ones within the gate, five times, is none.
 """
+WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
 UNKNOWN_SIGMA = 100.0  # Of positions in m and rotations in rad, of which nothing is known
 SAMPLES_MARGIN_S = 0.5  # Before the oldest knot: the sample before a knot tells where the next one begins
@@ -152,6 +153,16 @@ class InertialFixedLagSmoother(MeasurementWindow):
             return None
         knots = self._window.knots
         return knots.gyro_bias[-1], None if self._gyro_only is not None else knots.bias_or_acceleration[-1]
+
+    @property
+    def wheels(self) -> WheelsEstimate | None:
+        """Newest scale, slip and direction of the wheel odometry, and how much of it is rejected; None without it or without a trajectory."""
+        if self._odometry is None or self._solved is None or self._predictor is None:
+            return None
+        window = self._solved.window
+        steps = window.factors.odometry
+        assert steps is not None  # noqa: S101 (there is odometry)
+        return self._predictor.wheels(window.knots, steps, WHEELS_SPAN_S)
 
     @property
     def health(self) -> str | None:

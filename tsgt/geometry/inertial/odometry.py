@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry.inertial.states import TILT_DIM, WHEELS_DIM
-from tsgt.geometry.rigid import FloatArray, exp_so3, matvec, rotation_from_quaternion, skew
+from tsgt.geometry.rigid import FloatArray, dot, exp_so3, matvec, rotation_from_quaternion, skew
+from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -195,6 +196,32 @@ class _Angle:
 
     def _at(self, time_s: FloatArray) -> FloatArray:
         return np.stack([np.interp(time_s, self._bounds_s, each) for each in self._angle.T], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class WheelsEstimate:
+    """What the newest states tell of the wheel odometry."""
+
+    values: FloatArray  # (3,) scale, slip and direction
+    sigmas: FloatArray  # (3,)
+    driven_s: float  # Time of the last steps that samples cover
+    rejected_s: float  # Time of those among them that contradict IMU and prisms
+
+    @property
+    def rejected_share(self) -> float | None:
+        """Share of the time in which the wheels contradict IMU and prisms; None while there are no samples."""
+        return self.rejected_s / self.driven_s if self.driven_s > 0 else None
+
+
+def covered_steps(steps: OdometrySteps) -> NDArray[np.bool_]:
+    """(K,) whether samples cover the steps."""
+    covered: NDArray[np.bool_] = np.any(steps.whitening, axis=(1, 2))
+    return covered
+
+
+def rejected_steps(residuals: FloatArray) -> NDArray[np.bool_]:
+    """(K,) whether steps contradict the states, by their whitened residuals, (K, 3): they have hardly any weight."""
+    return dot(residuals, residuals) > OUTLIER_THRESHOLD**2
 
 
 def linearise_odometry(knots: InertialStates, steps: OdometrySteps) -> FloatArray:

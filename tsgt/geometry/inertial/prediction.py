@@ -8,11 +8,12 @@ last samples, as the motion prior says.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.inertial.odometry import linearise_odometry
+from tsgt.geometry.inertial.odometry import WheelsEstimate, covered_steps, linearise_odometry, rejected_steps
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import strapdown
 from tsgt.geometry.inertial.rate_prediction import RotationPredictor
@@ -53,6 +54,9 @@ class _Link:
     gravity: Gravity  # With the tilt
     covariance: FloatArray  # (D + 2, D + 2)
     by_start: FloatArray  # (D + 2, D + 2) by the error of the newest knot
+    wheels_rejected: bool | None = (
+        None  # Whether the wheels contradict the samples since the state before; None: no odometry
+    )
 
     @property
     def time_s(self) -> float:
@@ -92,6 +96,29 @@ class StrapdownPredictor:
     def discard_after(self, time_s: float) -> None:
         """Forget what was predicted beyond a time: samples there were missing."""
         self._links[1:] = [link for link in self._links[1:] if link.time_s <= time_s]
+
+    def wheels(self, knots: InertialStates, steps: OdometrySteps, duration_s: float) -> WheelsEstimate:
+        """Return what the newest state tells of the wheels, with the last steps between knots and beyond, up to a duration."""
+        newest = self._links[-1]
+        size = newest.state.dim
+        part = slice(INERTIAL_STATE_DIM, size)
+        from_s = newest.time_s - duration_s
+        first = int(np.searchsorted(knots.time_s[:-1], from_s))
+        last, covered = knots.select(slice(first, None)), steps.select(slice(first, None))
+        known = covered_steps(covered)
+        rejected = rejected_steps(linearise_odometry(last, covered)[:, :, -1])
+        step_s = np.diff(last.time_s)
+        beyond = [
+            (link.time_s - before.time_s, link.wheels_rejected)
+            for before, link in pairwise(self._links)
+            if before.time_s >= from_s and link.wheels_rejected is not None
+        ]
+        return WheelsEstimate(
+            newest.state.wheels[0],
+            np.sqrt(np.diagonal(newest.covariance)[part]),
+            float(step_s[known].sum()) + sum(each for each, _ in beyond),
+            float(step_s[known & rejected].sum()) + sum(each for each, wrong in beyond if wrong),
+        )
 
     def at(
         self, time_s: float, samples: InertialSamples, odometry: Odometry | None = None
@@ -191,8 +218,9 @@ class StrapdownPredictor:
         innovation = by_both @ link.covariance @ by_both.T + by_end @ noise @ by_end.T + np.eye(len(rows))
         gain = np.linalg.solve(innovation, mixed.T).T
         residual = rows[:, -1]
+        known = bool(covered_steps(steps)[0])
         if residual @ np.linalg.solve(innovation, residual) > OUTLIER_THRESHOLD**2:  # wheels that spin
-            return _Link(moved, link.gravity, covariance, by_start)
+            return _Link(moved, link.gravity, covariance, by_start, wheels_rejected=True)
         error = -gain @ residual
         covariance -= gain @ mixed.T
         return _Link(
@@ -200,6 +228,7 @@ class StrapdownPredictor:
             replace(link.gravity, tilt=link.gravity.tilt + error[size:]),
             0.5 * (covariance + covariance.T),
             by_start - gain @ by_both @ link.by_start,
+            wheels_rejected=False if known else None,
         )
 
     def _integrated(

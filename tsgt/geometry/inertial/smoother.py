@@ -16,7 +16,7 @@ import numpy as np
 from tsgt.errors import GeometryError
 from tsgt.geometry.inertial.factors import InertialFactors
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading, states_on_tracks
-from tsgt.geometry.inertial.odometry import Odometry
+from tsgt.geometry.inertial.odometry import Odometry, covered_steps, linearise_odometry, rejected_steps
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory
 from tsgt.geometry.inertial.sensitivity import residual_variances, setup_displacement
@@ -32,6 +32,8 @@ from tsgt.geometry.trajectory import nearest_knots
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
     from tsgt.geometry.inertial.initialisation import HeadingSearch
     from tsgt.geometry.inertial.odometry import WheelSamples
@@ -61,6 +63,15 @@ the velocity every 5 s: variance times 2 over the correlation time.
 
 
 @dataclass(frozen=True, slots=True)
+class WheelsFit:
+    """Wheel odometry of a fit, beside its estimate in the knots."""
+
+    sigmas: FloatArray  # (K, 3) of scale, slip and direction at the knots
+    covered: NDArray[np.bool_]  # (K - 1,) steps between knots that samples cover
+    rejected: NDArray[np.bool_]  # (K - 1,) those that contradict IMU and prisms
+
+
+@dataclass(frozen=True, slots=True)
 class InertialFit:
     """A trajectory with an IMU fitted to measurements; fields not explained here are those of a fit without."""
 
@@ -73,6 +84,7 @@ class InertialFit:
         FloatArray  # (M, 3) expected squares of the residuals; NaN where they carry no information
     )
     tilt_sigma_rad: float  # One sigma of the tilt of gravity after the fit, the larger of both
+    wheels: WheelsFit | None = None  # None without wheel odometry
 
 
 def estimation_noise(noise: ImuNoise) -> ImuNoise:
@@ -187,6 +199,13 @@ def fit_inertial_trajectory(
         np.concatenate([part.weights for part in ordered]),
         np.concatenate([part.residual_variances_m2 for part in ordered]),
         max(part.tilt_sigma_rad for part in ordered),
+        None
+        if wheels is None
+        else WheelsFit(
+            np.concatenate([part.wheels.sigmas for part in ordered if part.wheels]),
+            np.concatenate([part.wheels.covered for part in ordered if part.wheels]),
+            np.concatenate([part.wheels.rejected for part in ordered if part.wheels]),
+        ),
     )
 
 
@@ -204,6 +223,7 @@ class _Part:
     displacement: FloatArray | None
     tilt: FloatArray
     tilt_sigma_rad: float
+    wheels: WheelsFit | None
 
     @classmethod
     def of(
@@ -216,7 +236,8 @@ class _Part:
     ) -> _Part:
         """Return the knots ``kept`` and their measurements."""
         motion = slice(INERTIAL_STATE_DIM)
-        covariance, cross_covariance = (each[:, motion, motion] for each in solution.factor.marginals())
+        whole, cross_covariance = solution.factor.marginals()
+        covariance, cross_covariance = whole[:, motion, motion], cross_covariance[:, motion, motion]
         rows = slice(*np.searchsorted(solution.knot_index, (kept.start, kept.stop)))
         displacement = None
         if setup_jacobian is not None:
@@ -232,7 +253,18 @@ class _Part:
             displacement,
             solution.gravity.tilt,
             float(np.sqrt(np.diag(solution.factor.shared_covariance).max())),
+            _wheels(solution, whole, kept),
         )
+
+
+def _wheels(solution: InertialSolution, covariance: FloatArray, kept: slice) -> WheelsFit | None:
+    """Wheel odometry at the knots ``kept`` and on the steps after them; ``covariance``: (K, D, D) of all knots."""
+    steps = solution.factors.odometry
+    if steps is None:
+        return None
+    residuals = linearise_odometry(solution.knots, steps)[kept, :, -1]
+    variances = np.diagonal(covariance, axis1=1, axis2=2)[kept, INERTIAL_STATE_DIM:]
+    return WheelsFit(np.sqrt(variances), covered_steps(steps)[kept], rejected_steps(residuals))
 
 
 def find_start(

@@ -252,6 +252,11 @@ function showFacts(live) {
     facts.push(["radio", live.radio.protocol + (live.radio.authenticated ? ", with a key" : ", NO KEY: anybody can take part"), !live.radio.authenticated]);
   }
   if (live && live.imu) facts.push(["IMU", [live.imu.device, live.imu.use ? live.imu.use.replace("_", " ") : "", live.imu.rate_hz ? `${live.imu.rate_hz.toFixed(0)} Hz` : ""].filter(Boolean).join(", "), false]);
+  if (live && live.odometry) {
+    const { device, use, rate_hz, slip, rejected } = live.odometry;
+    const shown = [device, use ? use.replace("_", " ") : "", rate_hz ? `${rate_hz.toFixed(0)} Hz` : "", slip !== null ? `slip ${(100 * slip).toFixed(1)} %` : "", rejected ? `${(100 * rejected).toFixed(0)} % rejected` : ""];
+    facts.push(["wheels", shown.filter(Boolean).join(", "), use === "disagrees"]);
+  }
   if (live && live.pose && live.pose.speed_mps !== null) facts.push(["robot", `x ${live.pose.at[0].toFixed(2)}, y ${live.pose.at[1].toFixed(2)}, z ${live.pose.at[2].toFixed(2)} m; ${live.pose.speed_mps.toFixed(1)} m/s`, false]);
   rows(find("facts"), facts);
   find("storage").hidden = !facts.length;

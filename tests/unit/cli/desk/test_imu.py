@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from harness.imu_recording import IMU, imu_recording, shaken_drive, write
-from harness.records import HEADER
+from harness.records import HEADER, START
 
 from tsgt.analysis.formats import write_imu_mounting
 from tsgt.analysis.report import collect_findings, report_numbers, sections
-from tsgt.model import SetupCovariance
+from tsgt.model import OdometryParameters, OdometrySamples, SetupCovariance
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from harness.cli import Tsgt
+    from harness.inertial_drive import InertialDrive
 
 
 @pytest.fixture(scope="module")
@@ -96,10 +97,13 @@ def test_evaluate_predicts_held_out_measurements_with_the_imu(tsgt: Tsgt, folder
 
 
 @pytest.mark.slow
-def test_report_shows_the_imu(tmp_path: Path) -> None:
-    """Rate, biases with sigmas, and the gyro against the prisms; what the samples were made with is found."""
+def test_report_shows_imu_and_wheels(tmp_path: Path) -> None:
+    """Rate, biases with sigmas, the gyro against the prisms, scale and slip; what the samples were made with is found."""
     path = tmp_path / "field.jsonl"
-    recording = imu_recording(shaken_drive(22.0))
+    drive = shaken_drive(22.0)
+    recording = imu_recording(drive)
+    parameters = replace(recording.parameters, odometry=OdometryParameters())
+    recording = replace(recording, parameters=parameters, odometry=[driven(drive, 21.9, scale=0.98)])
     write(path, recording)
     found = collect_findings(recording, path, reference=None, with_held_out=False, refine="off")
     numbers = report_numbers(found)["imu_quality"]
@@ -108,10 +112,35 @@ def test_report_shows_the_imu(tmp_path: Path) -> None:
     innovation = numbers["rotation_innovation_deg"]
     assert innovation["rms"] < 1.5 * innovation["expected"]
     assert max(numbers["gyro_bias_sigma_dps"]) < 0.05
+    wheels = numbers["odometry"]
+    assert wheels["samples"] == 438
+    assert wheels["covered"] > 0.95
+    assert wheels["scale"] == pytest.approx(1 / 0.98 - 1, abs=3 * wheels["scale_sigma"])
+    assert wheels["slip_rms"] < 0.02
+    assert wheels["rejected"] < 0.05
     (section,) = [each for each in sections(found) if each.title == "IMU of the robot"]
     assert "stations 1, 2, 3" in section.text[0]
+    assert "Wheel odometry" in [table.caption for table in section.tables]
     section.plots[0].write([tmp_path / "biases.png"])
     assert (tmp_path / "biases.png").stat().st_size > 1000
+
+
+def driven(drive: InertialDrive, until_s: float, *, scale: float) -> OdometrySamples:
+    """Return the speed of a drive as wheel odometry at 20 Hz, with a scale."""
+    time_s = np.arange(0.0, until_s + 1e-9, 0.05)
+    position, rotation = drive.pose_at(time_s)
+    moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
+    stamps = tuple(START + round(1e9 * each) for each in time_s[1:].tolist())
+    return OdometrySamples(
+        sequence=0,
+        received_ns=stamps[-1],
+        stamp_ns=stamps,
+        duration_ns=(50_000_000,) * len(stamps),
+        instrument_time_ns=None,
+        speed_mps=tuple((scale * moved / 0.05).tolist()),
+        yaw_rate_radps=None,
+        valid=(True,) * len(stamps),
+    )
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 import pytest
-from harness.records import IMU_STATUS
+from harness.records import IMU_STATUS, ODOMETRY_STATUS
 
 from tsgt.cli.live.status_text import client_text, duration, master_text, station_label
 from tsgt.model import Status
@@ -166,6 +166,41 @@ def test_sound_imu_is_shown_with_its_biases() -> None:
 def test_problem_of_the_imu_is_shown(change: dict[str, object], word: str, *, sound: bool) -> None:
     """All but the last two require action."""
     lines, well = master_text(dataclasses.replace(MASTER, imu=dataclasses.replace(IMU_STATUS, **change)))  # type: ignore[arg-type]
+    assert word in "\n".join(lines)
+    assert well == sound
+
+
+def test_sound_wheels_are_shown_with_scale_and_slip() -> None:
+    """In narrow lines."""
+    lines, well = master_text(dataclasses.replace(MASTER, odometry=ODOMETRY_STATUS))
+    assert well
+    assert lines[-9:] == [
+        "",
+        click.style("WHEELS  OK", bold=True, reverse=False),
+        "  Acme base",
+        "  20.0 Hz  last 0.1 s",
+        "  1 gaps, 2 samples lost",
+        "  3 untrusted samples",
+        "  scale +1.25 +/- 0.20 %",
+        "  slip -2.1 +/- 1.2 %",
+        "  25 % rejected",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("change", "word", "sound"),
+    [
+        ({"age_s": None}, "NO SAMPLES YET", False),
+        ({"age_s": 3.0}, "SILENT 3.0 s", False),
+        ({"problem": "the encoder is not connected"}, "the encoder is not connected", False),
+        ({"use": "disagrees"}, "DISAGREE WITH IMU AND PRISMS", False),
+        ({"use": "without_imu"}, "NOT IN USE: NO IMU", True),
+    ],
+)
+def test_problem_of_the_wheels_is_shown(change: dict[str, object], word: str, *, sound: bool) -> None:
+    """All but the last require action."""
+    odometry = dataclasses.replace(ODOMETRY_STATUS, **change)  # type: ignore[arg-type]
+    lines, well = master_text(dataclasses.replace(MASTER, odometry=odometry))
     assert word in "\n".join(lines)
     assert well == sound
 

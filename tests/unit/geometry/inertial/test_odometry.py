@@ -169,6 +169,7 @@ def test_live_outage_with_odometry() -> None:
     end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
     wheels = WheelSamples(end_s, np.full(len(end_s), 0.05), 0.98 * moved / 0.05)
     errors = []
+    rejected: list[float | None] = []
     spinning = (end_s > 21.0) & (end_s < 23.0)
     for parameters, spin in ((None, 1.0), (OdometryParameters(), 1.0), (OdometryParameters(), 1.1)):
         driven_wheels = replace(wheels, speed_mps=np.where(spinning, spin, 1.0) * wheels.speed_mps)
@@ -189,8 +190,18 @@ def test_live_outage_with_odometry() -> None:
                 error = state.position[0] - drive.pose_at(np.array([now_s]))[0][0]
                 normalised.append(error @ np.linalg.solve(covariance[0, :3, :3], error))
                 squares.append(error @ error)
+            if now_s == 23.5 and parameters is not None:  # Samples are half a second late
+                rejected.append(found.rejected_share if (found := window.wheels) else None)
         assert window.converged
+        assert (window.wheels is None) == (parameters is None)
         assert np.mean(normalised) < 6.0
         errors.append(np.sqrt(np.mean(squares)))
         assert np.max(normalised) < 16.0
     assert max(errors[1:]) < 0.5 * errors[0]
+    assert rejected[0] == 0.0
+    assert rejected[1] is not None
+    assert 0.1 < rejected[1] < 0.8
+    found = window.wheels
+    assert found is not None
+    # Of the true speed the measured one is 0.98 times.
+    assert abs(found.values[:2].sum() - (1 / 0.98 - 1)) < 3 * found.sigmas[:2].sum()

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
 
     from tsgt.web.access import Access
+    from tsgt.web.foxglove import FoxgloveServer
 
 P = ParamSpec("P")
 
@@ -97,12 +98,17 @@ def in_real_time(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, No
 
 
 @asynccontextmanager
-async def served(state: MissionState, access: Access | None = None, **settings: Any) -> AsyncIterator[str]:
-    """Serve the page of a state on a free port of loopback; give its address."""
+async def served(
+    state: MissionState,
+    access: Access | None = None,
+    foxglove: FoxgloveServer | None = None,
+    **settings: Any,
+) -> AsyncIterator[str]:
+    """Serve the page of a state on a free port of loopback, also to Foxglove apps if so; give its address."""
     clock = SystemClock()
-    messages = LiveMessages(state, clock)
+    messages = LiveMessages(state, clock, foxglove.view if foxglove is not None else None)
     url: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-    page = Page(Settings(address="127.0.0.1", port=0, access=access, **settings), messages, clock)
+    page = Page(Settings(address="127.0.0.1", port=0, access=access, **settings), messages, clock, foxglove)
     tasks = [asyncio.create_task(messages.run()), asyncio.create_task(serve(page, url.set_result))]
     try:
         yield await url

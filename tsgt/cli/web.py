@@ -51,6 +51,11 @@ NEW_CODE = "(umask 077; tr -dc a-z0-9 < /dev/urandom | head -c 12 > web.code)"
 )
 @click.option("--certificate", type=path_type, help="Certificate chain (PEM) for TLS.")
 @click.option("--key", type=path_type, help="Private key (PEM) of the certificate.  [default: in its file]")
+@click.option(
+    "--foxglove",
+    is_flag=True,
+    help="Serve the live stream to the Foxglove app as well, on the same address and with the same code; needs the extra foxglove.",
+)
 def web(
     *,
     address: str,
@@ -61,6 +66,7 @@ def web(
     names: tuple[str, ...],
     certificate: Path | None,
     key: Path | None,
+    foxglove: bool,
 ) -> None:
     """Serve the operator's page to browsers.
 
@@ -71,8 +77,14 @@ def web(
         raise click.UsageError("--replay shows a recording, --socket a stream: give one of them")
     if key is not None and certificate is None:
         raise click.UsageError("--key belongs to a --certificate; give both")
+    if recording is not None and foxglove:
+        raise click.UsageError(
+            "--foxglove serves a live stream; for a recording: `tsgt export RECORDING --format mcap`, and open the file"
+        )
     listen = _address(address)
     require_extra("pages for browsers", "aiohttp", extra="web")
+    if foxglove:
+        require_extra("Foxglove", "foxglove", extra="foxglove")
     # Imported here: `--help` needs none of it.
     from tsgt import service
     from tsgt.clock import SystemClock
@@ -94,11 +106,25 @@ def web(
     else:
         from tsgt.web.program import run_live
 
-        service.run(lambda: run_live(socket_path or DEFAULT_SOCKET, settings, clock, _say))
+        apps, say = None, _say
+        if foxglove:
+            from tsgt.web.foxglove import FoxgloveServer
+
+            apps, say = FoxgloveServer, _say_with_code if code_file is not None else _say_both
+        service.run(lambda: run_live(socket_path or DEFAULT_SOCKET, settings, clock, say, apps))
 
 
 def _say(url: str) -> None:
     click.echo(f"the page is at {url}", err=True)
+
+
+def _say_both(url: str, query: str = "") -> None:
+    _say(url)
+    click.echo(f"open in Foxglove: {url.replace('http', 'ws', 1)}foxglove{query}", err=True)
+
+
+def _say_with_code(url: str) -> None:
+    _say_both(url, "?code=CODE")
 
 
 def _address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

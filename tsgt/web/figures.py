@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from tsgt.web.frames import worst_sigma
 from tsgt.web.stations import rounded
+from tsgt.web.verdict import POSE_AGE_LIMIT_S
 
 if TYPE_CHECKING:
     from tsgt.recording import PoseRecord, StatusRecord, ValidityLimits
@@ -25,14 +26,15 @@ def figures(
 
     ``share``: of the valid poses in the last minute. ``elapsed_s``: time since the last live pose.
     """
+    fresh = live if elapsed_s <= POSE_AGE_LIMIT_S else None
     ages = [each.age_s for each in live.stations if each.age_s is not None] if live is not None else []
     return {
-        "live": _sigmas(live),
+        "live": _sigmas(fresh),
         "smoothed": _sigmas(smoothed),
         "delay_s": smoothed.delay_s if smoothed is not None else None,
         "sigma_limit_mm": None if limits is None else _mm(limits.predicted_position_sigma_m),
         "smoothed_limit_mm": None if limits is None else _mm(limits.position_sigma_m),
-        "residual_mm": None if live is None else _mm(live.residual_m),
+        "residual_mm": None if fresh is None else _mm(fresh.residual_m),
         "residual_limit_mm": None if limits is None else _mm(limits.residual_m),
         "valid_share": rounded(share, 3),
         "poses": status.poses if status is not None else None,

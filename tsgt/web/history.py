@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tsgt.model import Vector3
 
 TRAIL_POINTS = 1500
 TRAIL_STEP_M = 0.15
@@ -45,21 +48,21 @@ class History:
 
 
 class Trail(History):
-    """Where the robot was: points [x, y] in m, and null where the trail is interrupted."""
+    """Where the robot was: points [x, y, z] in m, and null where the trail is interrupted."""
 
     def __init__(self) -> None:
         super().__init__(TRAIL_POINTS)
-        self._last: tuple[float, float] | None = None
+        self._last: Vector3 | None = None
         self._last_s = -math.inf
 
-    def point(self, x: float, y: float, now_s: float) -> None:
+    def point(self, position: Vector3, now_s: float) -> None:
         """Take a valid position."""
         if self._last is not None:
-            moved = math.dist(self._last, (x, y)) >= TRAIL_STEP_M
+            moved = math.dist(self._last, position) >= TRAIL_STEP_M
             if not moved and now_s - self._last_s < TRAIL_INTERVAL_S:
                 return
-        self._last, self._last_s = (x, y), now_s
-        self.add([round(x, 2), round(y, 2)])
+        self._last, self._last_s = position, now_s
+        self.add([round(each, 2) for each in position])
 
     def interrupt(self) -> None:
         """Take note that there is no valid position."""

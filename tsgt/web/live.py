@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from tsgt.web.messages import encode, message
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Mapping
+    from collections.abc import AsyncGenerator, Callable, Mapping
 
     from tsgt.clock import Clock
     from tsgt.web.state import MissionState
@@ -20,13 +20,22 @@ QUEUE_MESSAGES = 25
 
 
 class LiveMessages:
-    """Sends the same bytes to every reader, each through a queue of its own."""
+    """Sends the same bytes to every reader, each through a queue of its own.
+
+    ``viewed``: gets each view as well, with its time.
+    """
 
     replay = False
 
-    def __init__(self, state: MissionState, clock: Clock) -> None:
+    def __init__(
+        self,
+        state: MissionState,
+        clock: Clock,
+        viewed: Callable[[dict[str, Any], float], None] | None = None,
+    ) -> None:
         self._state = state
         self._clock = clock
+        self._viewed = viewed
         self._queues: set[asyncio.Queue[bytes | None]] = set()
 
     async def run(self) -> NoReturn:
@@ -40,6 +49,8 @@ class LiveMessages:
             await clock.sleep_until(due_ns)
             now_s = clock.monotonic_ns() / 1e9
             view = state.view(now_s)  # also without readers: the verdict is held over some views
+            if self._viewed is not None:
+                self._viewed(view, now_s)
             if self._queues:
                 self._put(encode(message(state, view, cursors, now_s)))
             cursors = state.cursors()

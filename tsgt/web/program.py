@@ -18,16 +18,27 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.clock import Clock
+    from tsgt.web.foxglove import FoxgloveServer
     from tsgt.web.server import Settings
 
 
-async def run_live(path: Path, settings: Settings, clock: Clock, opened: Callable[[str], None]) -> None:
-    """Serve the mission on a stream socket until cancelled; raises what :func:`serve` raises."""
+async def run_live(
+    path: Path,
+    settings: Settings,
+    clock: Clock,
+    opened: Callable[[str], None],
+    foxglove: Callable[[MissionState, Clock], FoxgloveServer] | None = None,
+) -> None:
+    """Serve the mission on a stream socket until cancelled; raises what :func:`serve` raises.
+
+    ``foxglove``: makes what serves it to Foxglove apps as well.
+    """
     state = MissionState(path.name)
-    messages = LiveMessages(state, clock)
-    page = Page(settings, messages, clock)
+    apps = foxglove(state, clock) if foxglove is not None else None
+    messages = LiveMessages(state, clock, apps.view if apps is not None else None)
+    page = Page(settings, messages, clock, apps)
     async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(follow(path, state, clock))
+        tasks.create_task(follow(path, apps or state, clock))
         tasks.create_task(messages.run())
         tasks.create_task(notify_systemd(lambda: f"{page.readers} readers", clock))
         tasks.create_task(serve(page, opened))

@@ -1,6 +1,6 @@
 """The HTTP server of the page: a thin shell around state and access.
 
-It answers GET of five fixed paths and one POST, the access code. Connections, requests and readers are limited, and each
+It answers GET of fixed paths, one of them a WebSocket for Foxglove apps if they are served, and one POST, the access code. Connections, requests and readers are limited, and each
 reader has a queue of its own: one that stalls is disconnected, and its browser connects again.
 """
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.clock import Clock
+    from tsgt.web.foxglove import FoxgloveServer
 
 MAX_READERS = 32
 MAX_REQUEST_BYTES = 1024
@@ -41,6 +42,10 @@ SEND_BUFFER_BYTES = 32_768
 """Of a reader's socket: what waits in larger ones would be old when it arrives."""
 
 COOKIE = "tsgt_web"
+
+FOXGLOVE_PATH = "/foxglove"
+FOXGLOVE_ORIGINS = frozenset({"file://", "https://app.foxglove.dev"})
+"""Of Foxglove's own app, on the desktop and in the browser. A program that is no browser sends none."""
 
 _FILES = {
     "/page.js": ("page.js", "text/javascript"),
@@ -84,6 +89,8 @@ class Page:
     settings: Settings
     messages: Messages
     clock: Clock
+    foxglove: FoxgloveServer | None = None
+    """Serves Foxglove apps; None: they are not served."""
     readers: int = 0
     _site: Site = field(init=False)
     _files: dict[str, bytes] = field(init=False)
@@ -105,6 +112,8 @@ class Page:
         application.router.add_get("/", self._index)
         application.router.add_get("/stream", self._stream)
         application.router.add_post("/login", self._login)
+        if self.foxglove is not None:
+            application.router.add_get(FOXGLOVE_PATH, self._foxglove, allow_head=False)
         for path in _FILES:
             application.router.add_get(path, self._file)
         return application
@@ -136,6 +145,8 @@ class Page:
         hosts = request.headers.getall("Host", [])
         if own is None or len(hosts) != 1 or not self._site.host_allowed(hosts[0], own[0], own[1]):
             raise web.HTTPMisdirectedRequest
+        if self.foxglove is not None and request.path == FOXGLOVE_PATH:
+            return  # has an origin of its own, and upgrades the connection
         origins = request.headers.getall("Origin", [])
         posted = request.method == "POST"
         if len(origins) > 1 or not self._site.origin_allowed(
@@ -213,15 +224,45 @@ class Page:
             raise web.HTTPUnauthorized
         if request.method != "GET":
             raise web.HTTPMethodNotAllowed(request.method, ["GET"])
+        return await self._counted(request, self._send_all)
+
+    async def _counted(
+        self,
+        request: web.Request,
+        serve_reader: Callable[[web.Request], Awaitable[web.StreamResponse]],
+    ) -> web.StreamResponse:
+        """Serve a reader, if there are not too many already."""
         if self.readers >= MAX_READERS:
             raise web.HTTPServiceUnavailable
         self.readers += 1
         log.info("web_reader_connected", address=request.remote, readers=self.readers)
         try:
-            return await self._send_all(request)
+            return await serve_reader(request)
         finally:
             self.readers -= 1
             log.info("web_reader_disconnected", address=request.remote, readers=self.readers)
+
+    async def _foxglove(self, request: web.Request) -> web.StreamResponse:
+        """Serve an app: with the access code in the address, else for Foxglove's own origins only."""
+        access = self.settings.access
+        origins = request.headers.getall("Origin", [])
+        if access is None:
+            if len(origins) > 1 or not FOXGLOVE_ORIGINS.issuperset(origins):
+                log.warning("foxglove_origin_rejected", origins=origins, address=request.remote)
+                raise web.HTTPForbidden
+        else:
+            address, now_s = request.remote or "", self.clock.monotonic_ns() / 1e9
+            if access.retry_after_s(address, now_s) > 0:
+                raise web.HTTPTooManyRequests
+            if not access.attempt(request.query.get("code", "")[:MAX_CODE_CHARACTERS], address, now_s):
+                log.warning("web_code_rejected", address=address)
+                raise web.HTTPForbidden
+        return await self._counted(request, self._converse)
+
+    async def _converse(self, request: web.Request) -> web.StreamResponse:
+        assert self.foxglove is not None  # noqa: S101 (else the path is not served)
+        _limit_buffers(request.transport)
+        return await self.foxglove.converse(request)
 
     async def _send_all(self, request: web.Request) -> web.StreamResponse:
         response = web.StreamResponse(headers={"Content-Type": "text/event-stream; charset=utf-8"})

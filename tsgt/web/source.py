@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import structlog
 
@@ -15,15 +15,27 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.clock import Clock
-    from tsgt.web.state import MissionState
 
 RETRY_S = 0.5
 
 log = structlog.get_logger()
 
 
-async def follow(path: Path, state: MissionState, clock: Clock) -> NoReturn:
-    """Pass the lines of a stream socket to the state; while there is none, what happened last is the problem."""
+class Follower(Protocol):
+    """Who gets the lines: the state of the page, with what else is served."""
+
+    def connected(self, now_s: float, /) -> None:
+        """Take note of a new connection to the stream."""
+
+    def disconnected(self, problem: str, /) -> None:
+        """Take note that there is none; ``problem``: why, in one line."""
+
+    def line(self, data: bytes, now_s: float, /) -> None:
+        """Take a line; raises ValueError if it is none."""
+
+
+async def follow(path: Path, follower: Follower, clock: Clock) -> NoReturn:
+    """Pass the lines of a stream socket on; while there is none, what happened last is the problem."""
     limiter = LogLimiter()
     problem = ""
     was_connected = True
@@ -36,21 +48,21 @@ async def follow(path: Path, state: MissionState, clock: Clock) -> NoReturn:
             log.info("stream_connected", path=str(path))
             was_connected = True
             try:
-                problem = await _read(reader, state, clock, limiter)
+                problem = await _read(reader, follower, clock, limiter)
             finally:
                 writer.close()
                 with contextlib.suppress(OSError):
                     await writer.wait_closed()
-        state.disconnected(problem)
+        follower.disconnected(problem)
         if was_connected:
             log.warning("stream_disconnected", problem=problem)
         was_connected = False
         await clock.sleep_until(clock.monotonic_ns() + round(RETRY_S * 1e9))
 
 
-async def _read(reader: asyncio.StreamReader, state: MissionState, clock: Clock, limiter: LogLimiter) -> str:
+async def _read(reader: asyncio.StreamReader, follower: Follower, clock: Clock, limiter: LogLimiter) -> str:
     """Read until the end; return why it ended."""
-    state.connected(clock.monotonic_ns() / 1e9)
+    follower.connected(clock.monotonic_ns() / 1e9)
     greeted = False
     while True:
         try:
@@ -61,7 +73,7 @@ async def _read(reader: asyncio.StreamReader, state: MissionState, clock: Clock,
             return "the stream has ended: the master was stopped or killed"
         now_ns = clock.monotonic_ns()
         try:
-            state.line(line, now_ns / 1e9)
+            follower.line(line, now_ns / 1e9)
         except ValueError as error:
             if not greeted:
                 return f"not a stream of tsgt: {error}"

@@ -26,7 +26,7 @@ from tsgt.web.figures import figures
 from tsgt.web.frames import add, inverse, product, rotate, subtract
 from tsgt.web.history import EVENTS, DelayEstimate, History, Residuals, Share, Trail
 from tsgt.web.stations import rounded
-from tsgt.web.verdict import Finding, Hold, Level, PoseFacts, StreamFacts, judge
+from tsgt.web.verdict import POSE_AGE_LIMIT_S, Finding, Hold, Level, PoseFacts, StreamFacts, judge
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -163,7 +163,7 @@ class MissionState:
         self._live = _Pose(record, now_s)
         self._stamp_ns = max(self._stamp_ns, record.stamp_ns)
         if record.valid and record.position_m is not None:
-            self.trail.point(record.position_m[0], record.position_m[1], now_s)
+            self.trail.point(record.position_m, now_s)
         else:
             self.trail.interrupt()
         self.residuals.point(
@@ -205,6 +205,19 @@ class MissionState:
         )
 
     # --- out --------------------------------------------------------------------------------------------------
+
+    @property
+    def setup(self) -> SetupRecord | None:
+        """The set-up in force; None while it is unknown."""
+        return self._setup
+
+    def sight_points(self, now_s: float) -> dict[int, Vector3]:
+        """Return where each station has just measured its prism, by its number."""
+        return {
+            number: sight.point_m
+            for number, sight in self._sights.items()
+            if sight.point_m is not None and now_s - sight.measured_s < stations.SIGHT_AGE_S
+        }
 
     def cursors(self) -> Cursors:
         """Return the ends of the histories, and the number of the set-up."""
@@ -312,6 +325,12 @@ class MissionState:
         pose = self._smoothed
         return pose.record if pose is not None and now_s - pose.at_s < SMOOTHED_AGE_LIMIT_S else None
 
+    def _valid_now(self, now_s: float) -> bool:
+        """Return whether there is a valid pose of now."""
+        pose = self._live
+        fresh = now_s - self._live_s <= POSE_AGE_LIMIT_S
+        return pose is not None and pose.record.valid and bool(self._live_valid) and fresh
+
     def _position(self) -> tuple[float, float] | None:
         record = self._live.record if self._live is not None else None
         if record is None or not record.valid or record.position_m is None:
@@ -324,7 +343,7 @@ class MissionState:
         record = self._live.record
         if record.position_m is None or record.orientation_xyzw is None:
             return None
-        position, orientation = self._robot(record.position_m, record.orientation_xyzw)
+        position, orientation = self.robot(record.position_m, record.orientation_xyzw)
         ahead = rotate(orientation, (1.0, 0.0, 0.0))
         prisms = self._setup.prisms if self._setup is not None else ()
         velocity = record.velocity_mps
@@ -336,12 +355,12 @@ class MissionState:
                 for each in prisms
             },
             "speed_mps": None if velocity is None else rounded(math.hypot(*velocity), 2),
-            "valid": record.valid,
+            "valid": self._valid_now(now_s),
             "age_s": rounded(now_s - self._live_s, 2),
             "kind": record.kind,
         }
 
-    def _robot(self, position: Vector3, orientation: Row4) -> tuple[Vector3, Row4]:
+    def robot(self, position: Vector3, orientation: Row4) -> tuple[Vector3, Row4]:
         """Return the pose of the frame ``robot``, from that of the reference point."""
         if self._setup is None:
             return position, orientation

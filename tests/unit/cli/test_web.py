@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -29,6 +30,7 @@ def test_address_without_a_code_is_refused(address: str) -> None:
         (("--listen", "robot.local"), "no IP address"),
         (("--replay", "r.jsonl", "--socket", "s"), "give one of them"),
         (("--key", "k.pem"), "--certificate"),
+        (("--replay", "r.jsonl", "--foxglove"), "tsgt export"),
     ],
 )
 def test_impossible_options_are_refused(arguments: tuple[str, ...], word: str) -> None:
@@ -36,6 +38,14 @@ def test_impossible_options_are_refused(arguments: tuple[str, ...], word: str) -
     outcome = called("web", *arguments)
     assert outcome.code == 2
     assert word in outcome.err
+
+
+def test_missing_foxglove_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one line, before anything is served."""
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    outcome = called("web", "--foxglove", "--port", "0")
+    assert outcome.code == 1
+    assert "tsgt[foxglove]" in outcome.err
 
 
 @pytest.mark.parametrize("content", [b"short", b"", b"two\nlines of it", b"\xff" * 12 + b"\x00", b"x" * 300])

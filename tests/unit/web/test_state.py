@@ -54,7 +54,10 @@ def test_stream_without_poses_is_no_green() -> None:
     """A status each second does not make an old pose a live one."""
     state = running()
     feed(state, status(11.2), now_s=11.2)
-    assert verdict(state, 11.3)[0] == "NO POSE"
+    view = state.view(11.3)
+    assert view["verdict"]["words"] == "NO POSE"
+    assert not view["pose"]["valid"]
+    assert view["figures"]["live"] is None
 
 
 def test_late_lines_are_no_live_view() -> None:
@@ -218,8 +221,8 @@ def test_histories_are_sent_once() -> None:
     cursors = state.cursors()
     feed(state, pose(10.5, position_m=(11.0, 10.0, 0.0)), now_s=10.5)
     then = message(state, {}, cursors, 10.5)
-    assert first["trail"]["items"] == [[10.0, 10.0]]
-    assert then["trail"] == {"first": 1, "items": [[11.0, 10.0]]}
+    assert first["trail"]["items"] == [[10.0, 10.0, 0.0]]
+    assert then["trail"] == {"first": 1, "items": [[11.0, 10.0, 0.0]]}
     assert ("setup" in first, "setup" in then) == (True, False)
     feed(state, SETUP, now_s=10.6)
     assert "setup" in message(state, {}, cursors, 10.6)

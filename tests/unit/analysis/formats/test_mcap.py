@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from harness import foxglove_layout
 from harness.records import HEADER
 from harness.scene import FRAMES, LAYOUT, START, driving, stationary_scene
 from hypothesis import given
@@ -203,6 +204,19 @@ def test_every_topic_is_documented(tmp_path: Path, poses: PoseBatch) -> None:
     rows = DOCUMENT.read_text(encoding="utf-8").splitlines()
     for topic in set(topics) - {"/tsgt/prism2", "/tsgt/prism3"}:
         assert [row for row in rows if row.startswith(f"| `{topic}`") and f"`{topics[topic]}`" in row], topic
+
+
+def test_layout_names_what_is_exported(tmp_path: Path, poses: PoseBatch) -> None:
+    """Every topic of the layout for Foxglove is in a file, and every path leads to a number in its message."""
+    reference = Reference(poses.stamp_ns[:1], np.zeros((1, 3)), np.eye(4)[[3]])
+    found = written(tmp_path / "a.mcap", RECORDING, poses, reference)
+    named = foxglove_layout.paths("recording.json")
+    assert {foxglove_layout.topic_of(path) for path in named} == set(found) - {"/tf", "/tf_static"}
+    for path in named:
+        topic = foxglove_layout.topic_of(path)
+        if path != topic:
+            _, message = found[topic][0]
+            assert np.isfinite(foxglove_layout.value_at(message, path.removeprefix(topic))), path
 
 
 def test_no_data_gives_an_empty_file(tmp_path: Path, poses: PoseBatch) -> None:

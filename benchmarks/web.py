@@ -1,10 +1,11 @@
 """The operator's page with five browsers: processor time and memory of `tsgt web`, and what it costs the stream's server.
 
 A recording's lines are served on a socket at their pace, again and again, first without `tsgt web`, then with it, five readers of the page and one
-that stalls. All readers are in a process of their own.
+that stalls. All readers are in a process of their own. With --chromium they are real browsers that show the page; the sixth is stopped (SIGSTOP) in the
+second half. With --foxglove a Foxglove app reads everything instead of them.
 
     tsgt simulate dynamic --duration 180 --seed 1 --output R.jsonl
-    python benchmarks/run.py web R.jsonl --seconds 600
+    python benchmarks/run.py web R.jsonl --seconds 600 [--chromium | --foxglove]
 """
 
 from __future__ import annotations
@@ -20,20 +21,42 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import AsyncExitStack
 from itertools import count, pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import aiohttp
+from harness.browser import CHROMIUM, browser
+from harness.foxglove import app
 
 from tsgt.master.stream_server import StreamServer
 from tsgt.recording import HelloRecord, encode_line
 from tsgt.web.recorded import index_of
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 BROWSERS = 5
 STAMP = re.compile(rb'("stamp_ns":)(\d+)')
 BASELINE_S = 60.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+START_S = 60.0
+REST_S = 5.0
+"""After the sixth browser is stopped, until the others' messages count for the second half."""
+
+Gaps = dict[str, list[float]]
+"""Times between messages of the page, in s, by what happened meanwhile."""
+ALL_RUN, ONE_STOPPED = "all run", "one is stopped"
+
+WATCH = """
+window.arrivals = [];
+window.EventSource = class extends EventSource {
+  constructor(url) { super(url); this.addEventListener("message", () => window.arrivals.push(performance.now() / 1000)); }
+};
+"""
+"""Notes when the page gets its messages."""
 
 
 def main() -> None:
@@ -43,12 +66,19 @@ def main() -> None:
     )
     parser.add_argument("recording", type=Path)
     parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--chromium", action="store_true", help="real browsers (apt install chromium)")
+    parser.add_argument("--foxglove", action="store_true", help="a Foxglove app instead (extra foxglove)")
     options = parser.parse_args()
+    if options.chromium and CHROMIUM is None:
+        sys.exit("chromium is not installed: apt install chromium")
+    readers_of = follow if options.foxglove else show_all if options.chromium else read_all
     with ProcessPoolExecutor(1) as pool:
-        asyncio.run(measure(options.recording, options.seconds, pool))
+        asyncio.run(measure(options.recording, options.seconds, pool, readers_of))
 
 
-async def measure(recording: Path, seconds: float, pool: ProcessPoolExecutor) -> None:
+async def measure(
+    recording: Path, seconds: float, pool: ProcessPoolExecutor, readers_of: Callable[[str, float], Gaps]
+) -> None:
     """Serve the stream, without the page and with it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "poses.sock"
@@ -65,30 +95,33 @@ async def measure(recording: Path, seconds: float, pool: ProcessPoolExecutor) ->
                 str(path),
                 "--port",
                 "0",
+                *(["--foxglove"] if readers_of is follow else []),
                 stderr=asyncio.subprocess.PIPE,
             )
             try:
                 url = await address(program)
-                readers = asyncio.get_running_loop().run_in_executor(pool, read_all, url, seconds)
+                found = asyncio.get_running_loop().run_in_executor(pool, readers_of, url, seconds)
                 await asyncio.sleep(1)
                 with_page, page = await asyncio.gather(
                     share(os.getpid(), seconds - 2), share(program.pid, seconds - 2)
                 )
                 peak_mb, now_mb = memory_mb(program.pid)
-                gaps = await readers
+                gaps = await found
             finally:
                 program.kill()
                 await program.wait()
                 play.cancel()
                 await asyncio.gather(play, return_exceptions=True)
-    print(f"{seconds:.0f} s, {BROWSERS} readers and a stalled one")
+    readers = "a Foxglove app" if readers_of is follow else f"{BROWSERS} readers and a stalled one"
+    print(f"{seconds:.0f} s, {readers}")
     print(f"tsgt web: {100 * page:.2f} % of a core, {now_mb:.1f} MB, at most {peak_mb:.1f} MB")
     print(f"server of the stream: {100 * before:.2f} % of a core without it, {100 * with_page:.2f} % with it")
-    ordered = sorted(gaps)
-    print(
-        f"messages of the readers: {len(gaps)}, gaps median {1e3 * statistics.median(gaps):.0f} ms, "
-        f"99 % {1e3 * ordered[int(0.99 * len(ordered))]:.0f} ms, most {1e3 * ordered[-1]:.0f} ms"
-    )
+    for when, each in gaps.items():
+        ordered = sorted(each)
+        print(
+            f"{when}: {len(each)} messages, gaps median {1e3 * statistics.median(each):.0f} ms, "
+            f"99 % {1e3 * ordered[int(0.99 * len(ordered))]:.0f} ms, most {1e3 * ordered[-1]:.0f} ms"
+        )
 
 
 async def address(program: asyncio.subprocess.Process) -> str:
@@ -139,12 +172,12 @@ def memory_mb(process: int) -> tuple[float, float]:
     return peak, now
 
 
-def read_all(url: str, seconds: float) -> list[float]:
+def read_all(url: str, seconds: float) -> Gaps:
     """Return the times between messages, as five readers get them, beside one that stalls."""
     return asyncio.run(_read_all(url, seconds))
 
 
-async def _read_all(url: str, seconds: float) -> list[float]:
+async def _read_all(url: str, seconds: float) -> Gaps:
     host = urlsplit(url)
     stalled = socket.socket()
     stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -153,7 +186,7 @@ async def _read_all(url: str, seconds: float) -> list[float]:
     async with aiohttp.ClientSession() as session:
         found = await asyncio.gather(*(_read(session, url, seconds) for _ in range(BROWSERS)))
     stalled.close()
-    return [gap for gaps in found for gap in gaps]
+    return {ONE_STOPPED: [gap for gaps in found for gap in gaps]}
 
 
 async def _read(session: aiohttp.ClientSession, url: str, seconds: float) -> list[float]:
@@ -165,6 +198,50 @@ async def _read(session: aiohttp.ClientSession, url: str, seconds: float) -> lis
             if "view" in json.loads(line.removeprefix(b"data: ")):
                 times.append(time.monotonic())
     return [b - a for a, b in pairwise(times)]
+
+
+def show_all(url: str, seconds: float) -> Gaps:
+    """Return the times between messages, as the page gets them in five browsers; a sixth is stopped halfway."""
+    return asyncio.run(_show_all(url, seconds))
+
+
+async def _show_all(url: str, seconds: float) -> Gaps:
+    end_s = time.monotonic() + seconds
+    gaps: Gaps = {}
+    async with AsyncExitStack() as stack:
+        windows = [await stack.enter_async_context(browser()) for _ in range(BROWSERS + 1)]
+        tabs = [await stack.enter_async_context(window.tab(url, first=WATCH)) for window in windows]
+        sixth, last = tabs.pop(), windows.pop()
+        for tab in (*tabs, sixth):
+            await tab.wait("window.arrivals?.length > 10", START_S)
+        for when, until_s in ((ALL_RUN, end_s - seconds / 2), (ONE_STOPPED, end_s)):
+            if when == ONE_STOPPED:
+                last.freeze()
+                await asyncio.sleep(REST_S)
+            for tab in tabs:
+                await tab.run("window.arrivals = []")
+            await asyncio.sleep(until_s - time.monotonic())
+            times = [await tab.run("window.arrivals") for tab in tabs]
+            gaps[when] = [b - a for each in times for a, b in pairwise(each)]
+        last.thaw()
+        await sixth.wait("window.arrivals.length > 0", START_S)
+    return gaps
+
+
+def follow(url: str, seconds: float) -> Gaps:
+    """Return the times between poses, as a Foxglove app gets them that has subscribed to everything."""
+    return asyncio.run(_follow(url, seconds))
+
+
+async def _follow(url: str, seconds: float) -> Gaps:
+    times: list[float] = []
+    end_s = time.monotonic() + seconds
+    async with app(f"{url}foxglove") as one:
+        await one.subscribe(*one.channels)
+        while time.monotonic() < end_s:
+            if (await one.message())[0] == "/tsgt/pose":
+                times.append(time.monotonic())
+    return {"poses": [b - a for a, b in pairwise(times)]}
 
 
 if __name__ == "__main__":

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import os
 import re
 import shutil
+import signal
 import tempfile
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -59,8 +61,8 @@ class Tab:
         result: dict[str, Any] = reply["result"]
         return result
 
-    async def open(self, url: str, width: int, height: int) -> Self:
-        """Open an address in a window of this size."""
+    async def open(self, url: str, width: int, height: int, first: str = "") -> Self:
+        """Open an address in a window of this size; ``first``: a script that runs before those of the page."""
         for domain in ("Page", "Runtime", "Log"):
             await self.call(f"{domain}.enable")
         await self.call(
@@ -70,6 +72,8 @@ class Tab:
             deviceScaleFactor=1,
             mobile=False,
         )
+        if first:
+            await self.call("Page.addScriptToEvaluateOnNewDocument", source=first)
         await self.call("Page.navigate", url=url)
         return self
 
@@ -110,18 +114,29 @@ class Tab:
 class Browser:
     """A running browser."""
 
-    def __init__(self, session: aiohttp.ClientSession, port: str) -> None:
+    def __init__(self, session: aiohttp.ClientSession, port: str, process: int) -> None:
         self._session = session
         self._url = f"http://127.0.0.1:{port}"
+        self._process = process
+
+    def freeze(self) -> None:
+        """Stop all its processes, as a computer does that sleeps."""
+        os.killpg(self._process, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """Let them go on."""
+        os.killpg(self._process, signal.SIGCONT)
 
     @asynccontextmanager
-    async def tab(self, url: str, width: int = 1280, height: int = 800) -> AsyncIterator[Tab]:
+    async def tab(
+        self, url: str, width: int = 1280, height: int = 800, first: str = ""
+    ) -> AsyncIterator[Tab]:
         """Open a page of its own."""
         async with self._session.put(f"{self._url}/json/new?about:blank") as response:
             target = json.loads(await response.text())
         tab = Tab(await self._session.ws_connect(target["webSocketDebuggerUrl"], max_msg_size=0))
         try:
-            yield await tab.open(url, width, height)
+            yield await tab.open(url, width, height, first)
         finally:
             await tab.close()
             async with self._session.get(f"{self._url}/json/close/{target['id']}"):
@@ -140,13 +155,15 @@ async def browser() -> AsyncIterator[Browser]:
             "about:blank",
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL,
+            start_new_session=True,
         )
         try:
             port = await _port(Path(profile) / "DevToolsActivePort")
             async with aiohttp.ClientSession() as session:
-                yield Browser(session, port)
+                yield Browser(session, port, process.pid)
         finally:
-            process.terminate()
+            with suppress(ProcessLookupError):
+                process.terminate()
             await process.wait()
 
 

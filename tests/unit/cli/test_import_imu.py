@@ -128,7 +128,7 @@ def test_file_that_is_no_bag_is_one_line(tmp_path: Path) -> None:
     path.write_bytes(b"garbage")
     outcome = called("import", "imu", path, "--output", tmp_path / "imu.jsonl")
     assert outcome.code == 1
-    assert "is no bag of ROS 2 that can be read" in outcome.err
+    assert "is no bag of ROS that can be read" in outcome.err
 
 
 def test_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from tsgt.analysis.formats.bag import open_bag
 from tsgt.analysis.formats.csv_table import read_table
 from tsgt.analysis.formats.sample_runs import MIN_SAMPLES, SampleRun, sample_runs
-from tsgt.errors import InputFileError, MissingExtraError
+from tsgt.errors import InputFileError
 from tsgt.model import ImuSamples
 
 if TYPE_CHECKING:
@@ -75,34 +76,22 @@ def _table(path: Path) -> Iterator[FileSample]:
 
 
 def _bag(path: Path, topic: str | None) -> Iterable[FileSample]:
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 (an extra)
-        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
-    except ImportError as error:
-        raise MissingExtraError("bags of ROS 2", library="rosbags", extra="mcap") from error
-    if not path.exists():
-        raise InputFileError("cannot be read: No such file or directory", path=path)
-    samples = []
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            found = [each for each in reader.connections if each.msgtype == _MESSAGE]
-            topics = sorted({each.topic for each in found})
-            if topic is None and len(topics) > 1:
-                raise InputFileError(
-                    f"has several topics of an IMU: {', '.join(topics)}; give --topic", path=path
-                )
-            chosen = [each for each in found if topic in (None, each.topic)]
-            if not chosen:
-                raise InputFileError(
-                    f"has no topic of an IMU{'' if topic is None else f' named {topic}'}", path=path
-                )
-            for connection, _, data in reader.messages(connections=chosen):
-                samples.append(_sample(reader.deserialize(data, connection.msgtype)))
-    except (AnyReaderError, OSError, ValueError, KeyError, AttributeError, IndexError) as error:
-        if isinstance(error, InputFileError):
-            raise
-        raise InputFileError(f"is no bag of ROS 2 that can be read: {error}", path=path) from error
-    return samples
+    with open_bag(path) as reader:
+        found = [each for each in reader.connections if each.msgtype == _MESSAGE]
+        topics = sorted({each.topic for each in found})
+        if topic is None and len(topics) > 1:
+            raise InputFileError(
+                f"has several topics of an IMU: {', '.join(topics)}; give --topic", path=path
+            )
+        chosen = [each for each in found if topic in (None, each.topic)]
+        if not chosen:
+            raise InputFileError(
+                f"has no topic of an IMU{'' if topic is None else f' named {topic}'}", path=path
+            )
+        return [
+            _sample(reader.deserialize(data, connection.msgtype))
+            for connection, _, data in reader.messages(connections=chosen)
+        ]
 
 
 def _sample(message: object) -> FileSample:

@@ -245,7 +245,8 @@ def _sigmas(into: FloatArray, covariance: FloatArray) -> FloatArray:
     blocks = (covariance[:, :3, :3], covariance[:, 3:, 3:])
     variances = [np.einsum("nij,njk,nik->ni", into, block, into, optimize=True) for block in blocks]
     # A variance that should be 0 may be less by rounding.
-    return np.sqrt(np.maximum(np.concatenate(variances, axis=1), 0.0))
+    sigmas: FloatArray = np.sqrt(np.maximum(np.concatenate(variances, axis=1), 0.0))
+    return sigmas
 
 
 @dataclass(frozen=True, slots=True)

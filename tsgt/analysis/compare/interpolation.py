@@ -90,7 +90,8 @@ class ReferenceTrajectory:
         # The last pose of a stretch belongs to the interval that ends there.
         found = np.clip(found, 0, len(self._rows) - 2)
         at_pose = (stamp_ns == self._stamp_ns[found]) & ~self._joined[found] & (found > 0)
-        return found - at_pose
+        interval: NDArray[np.intp] = found - at_pose
+        return interval
 
     def motion_at(self, stamp_ns: NDArray[np.int64]) -> ReferenceMotion:
         """Return the motion at N instants, anywhere."""

@@ -98,7 +98,8 @@ def explained_motion(pairs: PairedPoses, rows: NDArray[np.intp]) -> Explained:
 
 
 def _trace(blocks: FloatArray) -> FloatArray:
-    return np.einsum("nii->n", blocks)
+    traces: FloatArray = np.einsum("nii->n", blocks)
+    return traces
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,8 +43,10 @@ class FakePi:
         The pin whose level ``nss_during_transfer`` keeps for each transfer.
     answer, on_drive
         Response of the bus, and observer of every output.
-    open_error, transfer_error, request_errors, import_errors
-        What spidev raises on opening and on transferring, what asking for a pin raises, what an import raises.
+    open_error, transfer_error, request_errors
+        What spidev raises on opening and on transferring, and what asking for a pin raises.
+    drive_error, read_error, release_error
+        What setting an output, reading a pin or its edges, and releasing a pin raise.
     """
 
     def __init__(self, dev: Path, nss_pin: int | None = 25) -> None:
@@ -56,6 +58,16 @@ class FakePi:
         self.open_error: Exception | None = None
         self.transfer_error: Exception | None = None
         self.no_cs_error: Exception | None = None
+        self.drive_error: Exception | None = None
+        self.read_error: Exception | None = None
+        self.release_error: Exception | None = None
+        # The kernel keeps these from one program to the next.
+        self.bus_settings: dict[str, Any] = {
+            **dict.fromkeys(("no_cs", "cshigh", "lsbfirst", "loop", "threewire"), False),
+            "mode": 0,
+            "bits_per_word": 0,
+            "max_speed_hz": 500_000,
+        }
         self.request_errors: dict[int, Exception] = {}
         self.chip_error: Exception | None = None
         self.labels = {"gpiochip0": "raspberrypi-exp-gpio", "gpiochip4": "pinctrl-rp1"}
@@ -68,6 +80,8 @@ class FakePi:
 
     def drive(self, pin: int, *, level: bool) -> None:
         """Set an output, as a program does."""
+        if self.drive_error is not None:
+            raise self.drive_error
         self.levels[pin] = level
         self.on_drive(pin, level)
 
@@ -84,19 +98,21 @@ class FakePi:
             def __init__(self) -> None:
                 self._fd = -1
                 self.is_open = False
-                self.max_speed_hz = self.mode = -1
-                self._no_cs = False
                 pi.buses.append(self)
 
-            @property
-            def no_cs(self) -> bool:
-                return self._no_cs
+            def __getattr__(self, name: str) -> Any:
+                try:
+                    return pi.bus_settings[name]
+                except KeyError:
+                    raise AttributeError(name) from None
 
-            @no_cs.setter
-            def no_cs(self, value: bool) -> None:
-                if pi.no_cs_error is not None:
+            def __setattr__(self, name: str, value: Any) -> None:
+                if name == "no_cs" and pi.no_cs_error is not None:
                     raise pi.no_cs_error
-                self._no_cs = value
+                if name in pi.bus_settings:
+                    pi.bus_settings[name] = value
+                else:
+                    super().__setattr__(name, value)
 
             def open(self, bus: int, device: int) -> None:
                 if pi.open_error is not None:
@@ -188,6 +204,8 @@ class FakeRequest:
     def get_value(self, pin: int) -> Value:
         """Read the line."""
         assert pin == self.pin
+        if self._pi.read_error is not None:
+            raise self._pi.read_error
         return Value.ACTIVE if self._pi.levels[pin] else Value.INACTIVE
 
     def rise(self, timestamp_ns: int, *, lost: int = 0) -> None:
@@ -198,6 +216,8 @@ class FakeRequest:
 
     def read_edge_events(self) -> list[SimpleNamespace]:
         """Return all pending edges; would block without any."""
+        if self._pi.read_error is not None:
+            raise self._pi.read_error
         assert self._events, "read_edge_events() blocks when there are none"
         os.read(self.fd, 100)
         events, self._events = self._events, []
@@ -205,6 +225,8 @@ class FakeRequest:
 
     def release(self) -> None:
         """Release the line."""
+        if self._pi.release_error is not None:
+            raise self._pi.release_error
         del self._pi.levels[self.pin]
         os.close(self.fd)
         os.close(self._writer)
@@ -223,6 +245,7 @@ class FakeRpiGpio:
     RISING: int = 31
     PUD_DOWN: int = 21
     detect_error: Exception | None = None
+    mode_error: Exception | None = None
     callbacks: dict[int, Callable[[int], None]] = field(default_factory=dict)
     pulls: dict[int, int] = field(default_factory=dict)
     mode: int = 0
@@ -232,6 +255,8 @@ class FakeRpiGpio:
 
     def setmode(self, mode: int) -> None:
         """Accept the numbering of the pins."""
+        if self.mode_error is not None:
+            raise self.mode_error
         self.mode = mode
 
     def setup(self, pin: int, direction: int, *, initial: int = 0, pull_up_down: int = 20) -> None:
@@ -248,6 +273,8 @@ class FakeRpiGpio:
 
     def input(self, pin: int) -> int:
         """Read a pin."""
+        if self.pi.read_error is not None:
+            raise self.pi.read_error
         return int(self.pi.levels[pin])
 
     def add_event_detect(self, pin: int, edge: int, callback: Callable[[int], None]) -> None:
@@ -263,6 +290,8 @@ class FakeRpiGpio:
 
     def cleanup(self, pin: int) -> None:
         """Release a pin."""
+        if self.pi.release_error is not None:
+            raise self.pi.release_error
         del self.pi.levels[pin]
 
 

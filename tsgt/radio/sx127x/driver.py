@@ -2,7 +2,8 @@
 
 The flags in the chip state *what* happened, an edge of DIO0 only *when*: without its flag it is ignored; a flag without its
 edge is found by polling, and its timestamp has a large sigma. Access to several registers runs without an ``await`` or
-under one lock. A chip that does anything unexpected is reset and set up from the beginning: there is no other recovery.
+under one lock. A chip that does anything unexpected is reset and set up from the beginning: there is no other recovery. When that
+fails for seconds, who receives gets the error, to open bus and pins again.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ class SX127x:
         self._clock = clock
         self._allow_20_dbm = allow_20_dbm
         self._lock = asyncio.Lock()
-        self._packets: asyncio.Queue[Packet] = asyncio.Queue(QUEUE_CAPACITY)
+        self._packets: asyncio.Queue[Packet | RadioError] = asyncio.Queue(QUEUE_CAPACITY)
         self._supervisor: asyncio.Task[NoReturn] | None = None
         self._settings: LoRaSettings
         self._chip: Chip
@@ -170,8 +171,13 @@ class SX127x:
             return transmitted
 
     async def receive(self) -> Packet:
-        """See :meth:`tsgt.radio.base.Radio.receive`."""
-        return await self._packets.get()
+        """See :meth:`tsgt.radio.base.Radio.receive`; raises RadioError once the chip cannot be set up again for long."""
+        while True:
+            received = await self._packets.get()
+            if isinstance(received, Packet):
+                return received
+            if self._state is State.DOWN:
+                raise received
 
     async def close(self) -> None:
         """Put the chip to sleep and release bus and pins, after the end of a running transmission."""
@@ -213,6 +219,8 @@ class SX127x:
         for poll_at_ns in range(due_ns + TX_POLL_NS, due_ns + TX_TIMEOUT_NS + 1, TX_POLL_NS):
             timeout_s = max(0, poll_at_ns - self._clock.monotonic_ns()) / 1e9
             await asyncio.wait([self._tx_edge], timeout=timeout_s)
+            if not self._tx_edge.done():  # After the event loop did other things, the edge may be pending.
+                await self._process_pending_edges()
             if self._tx_edge.done():
                 edge = self._tx_edge.result()
                 return Transmission(
@@ -294,11 +302,14 @@ class SX127x:
 
     def _deliver(self, packet: Packet) -> None:
         self.statistics.received += 1
+        self._queue(packet)
+
+    def _queue(self, received: Packet | RadioError) -> None:
         if self._packets.full():
             self._packets.get_nowait()
             self.statistics.queue_overflows += 1
             log.warning("radio_queue_overflow", dropped=self.statistics.queue_overflows)
-        self._packets.put_nowait(packet)
+        self._packets.put_nowait(received)
 
     # --- Supervision ------------------------------------------------------------------------------------------
 
@@ -340,7 +351,11 @@ class SX127x:
             if self._retry_delay_ns == INITIAL_RETRY_DELAY_NS:
                 log.error("radio_unreachable", error=str(error))  # noqa: TRY400 (the message is complete)
             self._problem = str(error)
-            self._retry_delay_ns = min(2 * self._retry_delay_ns, MAX_RETRY_DELAY_NS)
+            longer_ns = min(2 * self._retry_delay_ns, MAX_RETRY_DELAY_NS)
+            if self._retry_delay_ns < longer_ns == MAX_RETRY_DELAY_NS:
+                # Bus or pins may be what fails: who receives opens them again.
+                self._queue(error)
+            self._retry_delay_ns = longer_ns
         else:
             log.info("radio_recovered", resets=self.statistics.resets)
 

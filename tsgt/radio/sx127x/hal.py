@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import fcntl
+import os
+import tempfile
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -50,11 +53,14 @@ class Hal(Protocol):
         ...
 
     def dio0(self) -> bool:
-        """Return the level of DIO0."""
+        """Return the level of DIO0. Raises RadioError if it cannot be read."""
         ...
 
     def on_dio0(self, callback: EdgeCallback) -> None:
-        """Call ``callback`` in the running event loop's thread for every further rising edge of DIO0."""
+        """Call ``callback`` in the running event loop's thread for every further rising edge of DIO0.
+
+        Raises RadioError if edges cannot be detected. If they cannot be read later, each further transfer raises it.
+        """
         ...
 
     def close(self) -> None:
@@ -120,6 +126,7 @@ class _PiHal(ABC):
 
     def __init__(self, wiring: Wiring, spi: _Spi) -> None:
         self._spi = spi
+        self._broken: RadioError | None = None  # Edges are no longer reported: only opening it again helps
         self._nss_pin, self._reset_pin, self._dio0_pin = wiring.nss_pin, wiring.reset_pin, wiring.dio0_pin
 
     @abstractmethod
@@ -132,7 +139,9 @@ class _PiHal(ABC):
     def on_dio0(self, callback: EdgeCallback) -> None: ...
 
     def transfer(self, data: bytes) -> bytes:
-        try:
+        if self._broken is not None:
+            raise self._broken
+        with _reported(f"{self._spi.path}: transfer failed"):
             if self._nss_pin is None:
                 return self._spi.transfer(data)
             self._drive(self._nss_pin, low=True)
@@ -140,18 +149,35 @@ class _PiHal(ABC):
                 return self._spi.transfer(data)
             finally:
                 self._drive(self._nss_pin, low=False)
-        except OSError as error:
-            raise RadioError(f"{self._spi.path}: transfer failed: {error}") from error
 
     def set_reset(self, *, low: bool) -> None:
-        try:
+        with _reported(f"BCM {self._reset_pin} (reset) cannot be set"):
             self._drive(self._reset_pin, low=low)
-        except OSError as error:
-            raise RadioError(f"{self._spi.path}: the reset pin cannot be set: {error}") from error
 
     def close(self) -> None:
         self._open.close()
         self._spi.close()
+
+
+@contextmanager
+def _reported(what: str) -> Iterator[None]:
+    """Report any failure of the packages as RadioError: gpiod also raises ValueError, RPi.GPIO RuntimeError, lgpio a plain Exception."""
+    try:
+        yield
+    except RadioError:
+        raise
+    except Exception as error:
+        raise RadioError(f"{what}: {error or type(error).__name__}") from error
+
+
+def _release(stack: ExitStack, function: Callable[..., object], *arguments: object) -> None:
+    """Call a function at the end, whatever it raises then: a pin of a chip that is gone cannot be released."""
+
+    def release() -> None:
+        with suppress(Exception):
+            function(*arguments)
+
+    stack.callback(release)
 
 
 _INSTALL = "pip install 'tsgt[pi]', on a Pi 5 'tsgt[pi5]'"
@@ -194,17 +220,27 @@ class _Spi:
         try:
             # Two programs on one radio would disturb each other, and the kernel allows it.
             fcntl.flock(self._bus.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._bus.mode = 0
-            self._bus.max_speed_hz = wiring.spi_hz
+            self._set_up(wiring)
         except BlockingIOError as error:
             self.close()
             raise RadioError(f"{self.path} is in use: tsgt runs twice, or two radios share it") from error
-        except OSError as error:
+        except Exception as error:
             self.close()
             raise RadioError(f"{self.path} cannot be set to mode 0, {wiring.spi_hz} Hz: {error}") from error
-        if wiring.nss_pin is not None:
-            with suppress(OSError):  # some controllers cannot disable their own chip select
-                self._bus.no_cs = True
+
+    def _set_up(self, wiring: Wiring) -> None:
+        """Set all settings: the kernel keeps those of the program before."""
+        self._bus.mode = 0
+        for flag in ("cshigh", "lsbfirst", "loop", "threewire"):
+            if getattr(self._bus, flag):
+                setattr(self._bus, flag, False)
+        self._bus.bits_per_word = 8
+        self._bus.max_speed_hz = wiring.spi_hz
+        by_pin = wiring.nss_pin is not None
+        if by_pin != self._bus.no_cs:
+            # Some controllers cannot switch their own chip select off, and need not: nothing is connected to it.
+            with suppress(OSError) if by_pin else contextlib.nullcontext():
+                self._bus.no_cs = by_pin
 
     def transfer(self, data: bytes) -> bytes:
         return bytes(self._bus.xfer2(list(data)))
@@ -258,6 +294,8 @@ class _GpiodHal(_PiHal):
                         return str(path)
         except PermissionError as error:
             raise RadioError(_GPIO_GROUP) from error
+        except Exception as error:
+            raise RadioError(f"{path} cannot be opened: {error}") from error
         raise RadioNotFoundError(
             f"no /dev/gpiochip* has the label {', '.join(self._CHIP_LABELS)}: on a board other than a Raspberry Pi, "
             "name it as gpio_chip"
@@ -276,27 +314,40 @@ class _GpiodHal(_PiHal):
             if error.errno == errno.EBUSY:
                 raise _busy(pin, role) from error
             raise RadioError(f"BCM {pin} ({role}) is not available: {error}") from error
-        stack.callback(self._lines[pin].release)
+        except Exception as error:  # ValueError: the chip has no such line
+            raise RadioError(f"BCM {pin} ({role}) is not available on {self._chip}: {error}") from error
+        _release(stack, self._lines[pin].release)
 
     def _drive(self, pin: int, *, low: bool) -> None:
         self._lines[pin].set_value(pin, self._low if low else self._released)
 
     def dio0(self) -> bool:
-        return bool(self._lines[self._dio0_pin].get_value(self._dio0_pin) == self._released)
+        with _reported(f"BCM {self._dio0_pin} (DIO0) cannot be read"):
+            return bool(self._lines[self._dio0_pin].get_value(self._dio0_pin) == self._released)
 
     def on_dio0(self, callback: EdgeCallback) -> None:
         line = self._lines[self._dio0_pin]
+        loop = asyncio.get_running_loop()
 
         def read_edges() -> None:
-            for event in line.read_edge_events():
+            try:
+                with _reported(f"edges of BCM {self._dio0_pin} (DIO0) cannot be read"):
+                    events = line.read_edge_events()
+            except RadioError as error:
+                # A line that is gone stays readable, and would be read again at once, for ever.
+                loop.remove_reader(fd)
+                self._broken = error
+                return
+            for event in events:
                 # The sequence number increments with each edge; a full buffer drops the oldest.
                 lost = event.line_seqno - self._last_seqno - 1
                 self._last_seqno = event.line_seqno
                 callback(Edge(event.timestamp_ns, lost))
 
-        loop = asyncio.get_running_loop()
-        loop.add_reader(line.fd, read_edges)
-        self._open.callback(loop.remove_reader, line.fd)
+        with _reported(f"edges of BCM {self._dio0_pin} (DIO0) cannot be awaited"):
+            fd = line.fd
+            loop.add_reader(fd, read_edges)
+        _release(self._open, loop.remove_reader, fd)
 
 
 class _RpiGpioHal(_PiHal):
@@ -304,19 +355,27 @@ class _RpiGpioHal(_PiHal):
 
     stamp_sigma_ns = 1_000_000
 
+    _LGPIO_DELAY_NS = 500_000
+    """lgpio, below rpi-lgpio, holds each edge for that long, to report those of all pins in order (its lgPthAlerts.c)."""
+
     def __init__(self, wiring: Wiring, spi: _Spi) -> None:
         super().__init__(wiring, spi)
         try:
-            from RPi import GPIO  # noqa: PLC0415 (only on a Pi)
+            with _writable_folder():
+                from RPi import GPIO  # noqa: PLC0415 (only on a Pi)
         except ImportError as error:
             raise RadioError(f"the Python package RPi.GPIO is missing: {_INSTALL}") from error
-        except RuntimeError as error:
+        except Exception as error:
             raise RadioError(
                 f"RPi.GPIO does not work on this board ({error}): use gpiod or rpi-lgpio"
             ) from error
         self._gpio = GPIO
-        GPIO.setwarnings(False)  # a killed program leaves its pins configured
-        GPIO.setmode(GPIO.BCM)
+        self._delay_ns = self._LGPIO_DELAY_NS if hasattr(GPIO, "lgpio") else 0
+        try:
+            GPIO.setwarnings(False)  # a killed program leaves its pins configured
+            GPIO.setmode(GPIO.BCM)
+        except Exception as error:
+            raise _not_available("the GPIO chip", error) from error
         with ExitStack() as stack:
             if self._nss_pin is not None:
                 self._set_up(stack, self._nss_pin, "NSS", GPIO.OUT, initial=GPIO.HIGH)
@@ -330,29 +389,46 @@ class _RpiGpioHal(_PiHal):
         except Exception as error:  # rpi-lgpio raises its own class, unknown to RPi.GPIO
             if "busy" in str(error).lower():
                 raise _busy(pin, role) from error
-            if "/dev/mem" in str(error) or "permission" in str(error).lower():
-                raise RadioError(_GPIO_GROUP) from error
-            raise RadioError(f"BCM {pin} ({role}) is not available: {error}") from error
-        stack.callback(self._gpio.cleanup, pin)
+            raise _not_available(f"BCM {pin} ({role})", error) from error
+        _release(stack, self._gpio.cleanup, pin)
 
     def _drive(self, pin: int, *, low: bool) -> None:
         self._gpio.output(pin, self._gpio.LOW if low else self._gpio.HIGH)
 
     def dio0(self) -> bool:
-        return bool(self._gpio.input(self._dio0_pin))
+        with _reported(f"BCM {self._dio0_pin} (DIO0) cannot be read"):
+            return bool(self._gpio.input(self._dio0_pin))
 
     def on_dio0(self, callback: EdgeCallback) -> None:
         loop = asyncio.get_running_loop()
 
         def on_thread_edge(_channel: int) -> None:
-            edge = Edge(time.monotonic_ns())
+            edge = Edge(time.monotonic_ns() - self._delay_ns)
             with suppress(RuntimeError):  # the loop was closed
                 loop.call_soon_threadsafe(callback, edge)
 
         try:
             self._gpio.add_event_detect(self._dio0_pin, self._gpio.RISING, callback=on_thread_edge)
-        except RuntimeError as error:
+        except Exception as error:
             raise RadioError(
                 f"RPi.GPIO gets no interrupts ({error}), as on every kernel since 6.6: use gpiod or rpi-lgpio"
             ) from error
-        self._open.callback(self._gpio.remove_event_detect, self._dio0_pin)
+        _release(self._open, self._gpio.remove_event_detect, self._dio0_pin)
+
+
+def _not_available(what: str, error: Exception) -> RadioError:
+    if "/dev/mem" in str(error) or "permission" in str(error).lower():
+        return RadioError(_GPIO_GROUP)
+    return RadioError(f"{what} is not available: {error}")
+
+
+@contextmanager
+def _writable_folder() -> Iterator[None]:
+    """Work in a temporary folder: lgpio makes a pipe in the working directory when it is imported, and a service has ``/``."""
+    before = os.environ.pop("LG_WD", None)  # It would lead lgpio elsewhere
+    try:
+        with tempfile.TemporaryDirectory(prefix="tsgt-") as folder, contextlib.chdir(folder):
+            yield
+    finally:
+        if before is not None:
+            os.environ["LG_WD"] = before

@@ -16,6 +16,8 @@ from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.lora import Air, LinkModel
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
     from tsgt.radio.sx127x import EdgeCallback
 
 
@@ -166,6 +168,29 @@ async def test_transmission_without_edge_is_found_by_polling() -> None:
         assert abs(sent.done_at_ns - true_done_ns) <= sent.stamp_sigma_ns
         assert b.here.radio.statistics.lost_edges == 1
         assert b.here.radio.statistics.transmitted == 1
+
+
+async def test_edge_of_a_transmission_is_taken_before_the_poll(monkeypatch: pytest.MonkeyPatch) -> None:
+    """When the event loop was busy at the end of a packet, its timestamp is the edge's, not a computed one."""
+    async with bench() as b:
+        sending = asyncio.create_task(b.here.radio.transmit(bytes(34)))
+        await wait_ms(b, 50)
+        edges: list[Edge] = []
+        deliver = b.here.radio._on_edge
+        b.here.hal.on_dio0(edges.append)
+        monkeypatch.setattr(b.here.radio, "_process_pending_edges", delivering(edges, deliver))
+        assert (await sending).stamp_sigma_ns == b.here.hal.stamp_sigma_ns
+        assert b.here.radio.statistics.lost_edges == 0
+
+
+def delivering(edges: list[Edge], deliver: Callable[[Edge], None]) -> Callable[[], Awaitable[None]]:
+    """Hold edges back until pending ones are asked for."""
+
+    async def process() -> None:
+        while edges:
+            deliver(edges.pop(0))
+
+    return process
 
 
 async def test_edges_that_the_kernel_dropped_are_counted() -> None:
@@ -365,6 +390,22 @@ async def test_radio_recovers_from_bus_errors() -> None:
 def failing_transfer(_data: bytes) -> bytes:
     """Fail as the bus of a Pi would."""
     raise RadioError("/dev/spidev0.0: transfer failed")
+
+
+async def test_radio_that_stays_down_ends_the_wait_for_a_packet() -> None:
+    """Who only receives is told, and can open bus and pins again."""
+    async with bench() as b:
+        receiving = asyncio.create_task(b.here.radio.receive())
+        b.here.chip.disconnect_bus(level=True)
+        await wait_ms(b, 3_000)
+        assert not receiving.done()
+        await wait_ms(b, 10_000)
+        assert receiving.done()
+        with pytest.raises(RadioError, match="no radio responds"):
+            await receiving
+        b.here.chip.reconnect_bus()
+        await wait_ms(b, MAX_RETRY_DELAY_NS / MS + 100)
+        await assert_both_ways(b)
 
 
 async def test_failed_change_of_settings_is_retried() -> None:

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import sys
 import time
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -15,9 +17,6 @@ from tsgt.errors import RadioError, RadioNotFoundError, RadioSettingsError
 from tsgt.radio.sx127x import DRAGINO_HAT, Edge, SX127x, Wiring, hal, open_hal
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.lora import Air, LinkModel
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 Backend = Literal["gpiod", "rpi-gpio"]
 BACKENDS = pytest.mark.parametrize("backend", ["gpiod", "rpi-gpio"])
@@ -68,6 +67,68 @@ def test_bus_is_opened_in_the_mode_of_the_chip(pi: FakePi, backend: Backend) -> 
     (bus,) = pi.buses
     assert (bus.mode, bus.max_speed_hz, bus.no_cs) == (0, 500_000, True)
     opened.close()
+
+
+@BACKENDS
+@pytest.mark.parametrize("nss_pin", [25, None])
+def test_settings_of_the_program_before_are_replaced(
+    pi: FakePi, backend: Backend, nss_pin: int | None
+) -> None:
+    """The kernel keeps mode, chip select, bit order and word size from one program to the next."""
+    pi.nss_pin = nss_pin
+    flags = ("no_cs", "cshigh", "lsbfirst", "loop", "threewire")
+    pi.bus_settings.update(mode=3, bits_per_word=16, **dict.fromkeys(flags, True))
+    opened = open_hal(hat(backend, nss_pin=nss_pin))
+    found = pi.bus_settings
+    assert (found["mode"], found["bits_per_word"]) == (0, 8)
+    assert [found[flag] for flag in flags] == [nss_pin is not None, False, False, False, False]
+    opened.close()
+
+
+def test_controller_that_keeps_its_chip_select_off_is_rejected(pi: FakePi) -> None:
+    """A radio on CE0 cannot be reached while the setting of the program before remains."""
+    pi.bus_settings["no_cs"] = True
+    pi.no_cs_error = OSError(errno.EINVAL, "Invalid argument")
+    with pytest.raises(RadioError, match=r"/dev/spidev0\.0 cannot be set to mode 0, .*Invalid argument"):
+        open_hal(hat(nss_pin=None))
+    assert pi.open_things == 0
+
+
+class LgpioError(Exception):
+    """lgpio's own class is a plain Exception, too."""
+
+
+@BACKENDS
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENODEV, "No such device"),
+        RuntimeError("not set up"),
+        LgpioError("bad handle"),
+        ValueError(),
+    ],
+)
+def test_any_failure_of_a_pin_is_a_radio_error(pi: FakePi, backend: Backend, error: Exception) -> None:
+    """Whatever a package raises at a transfer, a reset, or a look at DIO0: the driver gets its own error."""
+    opened = open_hal(hat(backend))
+    pi.drive_error = pi.read_error = error
+    with pytest.raises(RadioError, match=r"/dev/spidev0\.0: transfer failed"):
+        opened.transfer(b"\x42\x00")
+    with pytest.raises(RadioError, match=r"BCM 17 \(reset\) cannot be set"):
+        opened.set_reset(low=True)
+    with pytest.raises(RadioError, match=r"BCM 4 \(DIO0\) cannot be read"):
+        opened.dio0()
+    pi.drive_error = None
+    opened.close()
+
+
+@BACKENDS
+def test_pin_that_cannot_be_released_keeps_nothing_open(pi: FakePi, backend: Backend) -> None:
+    """close() releases the bus although the GPIO chip is gone."""
+    opened = open_hal(hat(backend))
+    pi.release_error = LgpioError("bad handle")
+    opened.close()
+    assert not any(bus.is_open for bus in pi.buses)
 
 
 @BACKENDS
@@ -319,6 +380,37 @@ async def test_gpiod_edges_have_the_kernel_timestamp(pi: FakePi) -> None:
     opened.close()
 
 
+def test_line_that_the_chip_does_not_have_is_named(pi: FakePi) -> None:
+    """The package gpiod raises ValueError for a pin like 60."""
+    pi.request_errors[17] = ValueError("invalid line offset")
+    with pytest.raises(RadioError, match=r"BCM 17 \(reset\) is not available on .*gpiochip4: invalid line"):
+        open_hal(hat())
+    assert pi.open_things == 0
+
+
+def test_chip_that_cannot_be_opened_is_named(pi: FakePi) -> None:
+    """Any other failure of the search for the chip."""
+    pi.chip_error = OSError(errno.ENODEV, "No such device")
+    with pytest.raises(RadioError, match=r"gpiochip0 cannot be opened: .*No such device"):
+        open_hal(hat())
+
+
+async def test_edges_that_cannot_be_read_fail_the_next_transfer(pi: FakePi) -> None:
+    """The line is read once, not for ever, and the radio is reported as broken until it is opened again."""
+    opened = open_hal(hat())
+    edges: list[Edge] = []
+    opened.on_dio0(edges.append)
+    pi.read_error = OSError(errno.ENODEV, "No such device")
+    pi.requests[-1].rise(1_000)
+    for _ in range(3):
+        await asyncio.sleep(0)
+    with pytest.raises(RadioError, match=r"edges of BCM 4 \(DIO0\) cannot be read: .*No such device"):
+        opened.transfer(b"\x42\x00")
+    assert not asyncio.get_running_loop().remove_reader(pi.requests[-1].fd)
+    assert edges == []
+    opened.close()
+
+
 # --- RPi.GPIO -----------------------------------------------------------------------------------------------------
 
 
@@ -374,3 +466,47 @@ def test_rpi_gpio_on_another_board_names_the_remedy(pi: FakePi, monkeypatch: pyt
     monkeypatch.setitem(sys.modules, "RPi", Refusing())
     with pytest.raises(RadioError, match=r"Cannot determine SOC .*use gpiod or rpi-lgpio"):
         open_hal(hat("rpi-gpio"))
+
+
+def test_gpio_chip_that_rpi_lgpio_cannot_open_is_reported(pi: FakePi) -> None:
+    """It is opened when the numbering of the pins is chosen."""
+    rpi_gpio().mode_error = LgpioError("can not open gpiochip")
+    with pytest.raises(RadioError, match="the GPIO chip is not available: can not open gpiochip"):
+        open_hal(hat("rpi-gpio"))
+    assert pi.open_things == 0
+
+
+async def test_edges_of_lgpio_are_half_a_millisecond_old(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds them that long, and rpi-lgpio passes no timestamp on."""
+    del pi
+    monkeypatch.setattr(rpi_gpio(), "lgpio", object(), raising=False)
+    opened = open_hal(hat("rpi-gpio"))
+    edges: asyncio.Queue[Edge] = asyncio.Queue()
+    opened.on_dio0(edges.put_nowait)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 10_000_000)
+    rpi_gpio().callbacks[4](4)
+    assert (await edges.get()).at_ns == 9_500_000
+    opened.close()
+
+
+def test_rpi_lgpio_is_imported_in_a_writable_folder(pi: FakePi, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It makes a pipe where it is imported; afterwards the working directory is as before."""
+    del pi
+    gpio = rpi_gpio()
+
+    class Importing:
+        @property
+        def GPIO(self) -> object:  # noqa: N802 (its name)
+            Path("pipe").touch()
+            imported_in.append(Path.cwd())
+            return gpio
+
+    before, imported_in = Path.cwd(), list[Path]()
+    monkeypatch.setitem(sys.modules, "RPi", Importing())
+    monkeypatch.setenv("LG_WD", "/nowhere")
+    open_hal(hat("rpi-gpio")).close()
+    assert imported_in
+    assert before not in imported_in
+    assert not imported_in[0].exists()
+    assert Path.cwd() == before
+    assert os.environ["LG_WD"] == "/nowhere"

@@ -143,12 +143,16 @@ class Journal:
 
 
 def is_unfinished_journal(path: Path) -> bool:
-    """Return whether the client ended before the first lines were complete. Raises RecordingError if unreadable."""
+    """Return whether the client ended before the first lines were complete; a power cut leaves zero bytes in their place.
+
+    Raises RecordingError if unreadable.
+    """
     try:
         with path.open("rb") as file:
             first, second = (file.readline(MAX_LINE_BYTES) for _ in range(2))
     except OSError as error:
         raise RecordingError(f"cannot be read ({error.strerror})", path=path) from error
+    first = first.rstrip(b"\0")
     return (HEADER_START.startswith(first) or first.startswith(HEADER_START)) and not second.endswith(b"\n")
 
 

@@ -87,12 +87,16 @@ def read_lines(
     for number, raw in enumerate(_raw_lines(path), start=1):
         if not imu and number > 1 and raw.startswith(_IMU_START) and raw.endswith(b"\n"):
             continue
-        data = raw.removesuffix(b"\n")
+        data = raw.removesuffix(b"\n") if raw.endswith(b"\n") else raw.rstrip(b"\0")
         try:
             kind = decode(Typed, data).type
             if kind == "recording":
                 check_header(data, path, number)
         except ValueError as error:
+            if number == 1 and not raw.strip(b"\0"):
+                raise RecordingError(
+                    "holds only zero bytes: a power cut came before its first line was on the disk", path=path
+                ) from error
             if number == 1:
                 raise RecordingError(NO_HEADER, path=path) from error
             problem = _unreadable(raw, str(error), path, number)
@@ -213,7 +217,13 @@ def _unreadable(raw: bytes, why: str, path: Path, line: int) -> RecordingError:
             f"is longer than {MAX_LINE_BYTES} bytes; --keep-going skips it", path=path, line=line
         )
     if raw.endswith(b"\n"):
+        if b"\0" in raw:
+            why = "it holds zero bytes, as after a power cut"
         return CorruptLineError(f"cannot be read: {why}; --keep-going skips it", path=path, line=line)
+    if b"\0" in raw:
+        return RecordingError(
+            "the file ends with zero bytes, as after a power cut; they are skipped", path=path, line=line
+        )
     return RecordingError("the last line is torn and is skipped", path=path, line=line)
 
 

@@ -76,7 +76,7 @@ class RecordingWriter:
             file.seek(0)
             first = file.readline(MAX_LINE_BYTES)
             file.seek(whole_bytes)
-            tail = file.read(MAX_LINE_BYTES)
+            tail = file.read(MAX_LINE_BYTES).rstrip(b"\0")  # A power cut leaves zero bytes
         if size == 0:
             return 0
         only_newline_missing = _is_record(tail)
@@ -87,11 +87,11 @@ class RecordingWriter:
                 raise RecordingError(NO_HEADER, path=self._path) from error
         elif tail[: len(HEADER_START)] != HEADER_START[: len(tail)]:
             raise RecordingError(NO_HEADER, path=self._path)
+        keep_bytes = whole_bytes + len(tail) if only_newline_missing else whole_bytes
+        os.ftruncate(self._fd, keep_bytes)
         if only_newline_missing:
             self._append(b"\n")
-            return 0
-        os.ftruncate(self._fd, whole_bytes)
-        return size - whole_bytes
+        return size - keep_bytes
 
     def write(self, record: object) -> None:
         """Append a record as one line. Raises RecordingError if no part of it could be written; later ones may be."""

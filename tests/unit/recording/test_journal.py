@@ -10,7 +10,13 @@ from harness.records import HEADER, PARAMETERS, measurement
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import Status
 from tsgt.recording import encode_line
-from tsgt.recording.journal import JournalRecord, ReceptionRecord, TargetRecord, load_journal
+from tsgt.recording.journal import (
+    JournalRecord,
+    ReceptionRecord,
+    TargetRecord,
+    is_unfinished_journal,
+    load_journal,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,6 +51,14 @@ def test_journal_round_trip(tmp_path: Path) -> None:
     assert journal.measurements == [measurement(0), measurement(1)]
     assert journal.targets == [TARGET]
     assert "torn" in str(problems[0])
+
+
+@pytest.mark.parametrize("kept_bytes", [0, 25])
+def test_journal_that_a_power_cut_zeroed_is_unfinished(tmp_path: Path, kept_bytes: int) -> None:
+    """It began less than a second before the cut, and holds no measurement."""
+    path = tmp_path / "j.jsonl"
+    path.write_bytes(encode_line(HEADER)[:kept_bytes] + b"\0" * 4096)
+    assert is_unfinished_journal(path)
 
 
 def test_recording_is_not_a_journal(tmp_path: Path) -> None:

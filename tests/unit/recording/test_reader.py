@@ -260,10 +260,36 @@ def test_folder_is_one_line(tmp_path: Path) -> None:
         load_recording(tmp_path)
 
 
-def test_long_tail_of_zeros_is_torn(tmp_path: Path) -> None:
+@pytest.mark.parametrize("torn", [b"", b'{"type":"mea'])
+def test_long_tail_of_zeros_is_named(tmp_path: Path, torn: bytes) -> None:
     """A power cut may leave it."""
     path = tmp_path / "r.jsonl"
-    path.write_bytes(recording_bytes(measurement(0)) + b"\0" * 3_000_000)
+    path.write_bytes(recording_bytes(measurement(0)) + torn + b"\0" * 3_000_000)
     problems: list[RecordingError] = []
     assert len(load_recording(path, on_problem=problems.append).measurements) == 1
-    assert [str(problem).endswith("the last line is torn and is skipped") for problem in problems] == [True]
+    assert [str(problem) for problem in problems] == [
+        f"{path}, line 4: the file ends with zero bytes, as after a power cut; they are skipped"
+    ]
+
+
+def test_record_before_zeros_is_read(tmp_path: Path) -> None:
+    """A power cut may leave zeros in place of its newline."""
+    path = tmp_path / "r.jsonl"
+    path.write_bytes(recording_bytes(measurement(0)).rstrip(b"\n") + b"\0" * 100)
+    assert load_recording(path).measurements == [measurement(0)]
+
+
+def test_zeros_within_a_file_are_named(tmp_path: Path) -> None:
+    """Blocks of a file can be lost while later ones are on the disk."""
+    path = tmp_path / "r.jsonl"
+    path.write_bytes(recording_bytes(measurement(0)) + b'{"type":' + b"\0" * 100 + b"}\n")
+    with pytest.raises(CorruptLineError, match=r"line 4: .*zero bytes, as after a power cut; --keep-going"):
+        load_recording(path)
+
+
+def test_file_of_zeros_is_named(tmp_path: Path) -> None:
+    """Nothing of it was on the disk when the power was cut."""
+    path = tmp_path / "r.jsonl"
+    path.write_bytes(b"\0" * 4096)
+    with pytest.raises(RecordingError, match="holds only zero bytes: a power cut"):
+        load_recording(path)

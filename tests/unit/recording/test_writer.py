@@ -125,6 +125,23 @@ def test_missing_newline_is_added(path: Path) -> None:
     assert path.read_bytes() == recording_bytes(measurement(0))
 
 
+def test_record_before_zeros_keeps_its_place(path: Path) -> None:
+    """A power cut may leave zeros in place of the newline; they are removed, the record is not."""
+    path.write_bytes(recording_bytes(measurement(0)).rstrip(b"\n") + b"\0" * 100)
+    with RecordingWriter(path) as writer:
+        assert writer.cut_bytes == 100
+    assert path.read_bytes() == recording_bytes(measurement(0))
+
+
+@pytest.mark.parametrize("kept_bytes", [0, 10, 25])
+def test_header_that_a_power_cut_zeroed_is_cut_off(path: Path, kept_bytes: int) -> None:
+    """Whether some of it had reached the disk or nothing at all."""
+    path.write_bytes(encode_line(HEADER)[:kept_bytes] + b"\0" * 4096)
+    with RecordingWriter(path) as writer:
+        assert writer.cut_bytes == kept_bytes + 4096
+    assert path.read_bytes() == b""
+
+
 def test_torn_header_is_cut_off(path: Path) -> None:
     """A file that holds nothing but the beginning of a header becomes an empty one."""
     path.write_bytes(encode_line(HEADER)[:25])
@@ -134,7 +151,7 @@ def test_torn_header_is_cut_off(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"my notes", b"my notes\n", b"1 2 3 4\n5 6", b'{"type":"pose"}\n', b"\0\0"]
+    "content", [b"my notes", b"my notes\n", b"1 2 3 4\n5 6", b'{"type":"pose"}\n', b"\0x\0"]
 )
 def test_other_file_is_rejected_unchanged(path: Path, content: bytes) -> None:
     """Other file is rejected unchanged."""

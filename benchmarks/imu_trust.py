@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from imu import simulated
+from imu import mission_stem, simulated
 from imu_setup import CONFIGURED, SAMPLED, multiplied
 
 from tsgt.estimation import LiveEstimator, centroid_at_point
@@ -178,8 +178,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for seed in range(arguments.first, arguments.first + arguments.seeds):
             mission = simulated(arguments, seed, folder)
-            stem = f"{arguments.scenario}-{arguments.model}-{seed}-{arguments.duration:.0f}"
-            path = folder / f"{stem}.jsonl"
+            path = folder / f"{mission_stem(arguments, seed)}.jsonl"
             recording = load_recording(path)
             parameters = replace(with_stations(recording.parameters, arguments.stations), imu=mission.imu)
             records: list[Measurement | ImuSamples] = [
@@ -191,7 +190,7 @@ def main() -> None:
             records = sorted(
                 (each for each in records if each.received_ns <= until_ns), key=lambda each: each.received_ns
             )
-            truth = Truth(folder / f"{stem}.npz", parameters)
+            truth = Truth(path.with_suffix(".npz"), parameters)
             rng = np.random.default_rng([seed, 9])
             for name in ERRORS:
                 wrong, part = parameters, records

@@ -150,9 +150,15 @@ def simulated(
 def calibrated(exact: ImuParameters, device: ImuDevice) -> ImuParameters:
     """Return the exact set-up of a device in the axes that a calibration defines."""
     mounting = Mounting.of(exact, np.zeros(3))
-    matrices = (np.asarray(np.linalg.inv(each)) for each in (device.gyro_matrix, device.accelerometer_matrix))
     setup = in_calibrated_axes(
-        ImuSetup(mounting, exact.latency_ns / 1e9, *matrices, np.zeros(3), mounting.rotation[2].copy())
+        ImuSetup(
+            mounting,
+            exact.latency_ns / 1e9,
+            np.asarray(np.linalg.inv(device.gyro_matrix), np.float64),
+            np.asarray(np.linalg.inv(device.accelerometer_matrix), np.float64),
+            np.zeros(3),
+            mounting.rotation[2].copy(),
+        )
     )
     qx, qy, qz, qw = quaternion_from_rotation(setup.mounting.rotation).tolist()
     first, second, third = ((a, b, c) for a, b, c in setup.gyro_matrix.tolist())

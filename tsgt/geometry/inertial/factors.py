@@ -156,14 +156,14 @@ class InertialFactors:
 
 
 class InertialEquations(NamedTuple):
-    """Normal equations of K states and of the tilt of gravity, which borders them."""
+    """Normal equations of K states and of what they share, the S components of `Gravity`, which borders them."""
 
     diagonal: FloatArray  # (K, D, D)
     off_diagonal: FloatArray  # (K - 1, D, D)
     gradient: FloatArray  # (K, D)
-    border: FloatArray  # (K, D, 2) of states and tilt
-    corner: FloatArray  # (2, 2)
-    corner_gradient: FloatArray  # (2,)
+    border: FloatArray  # (K, D, S) of states and what they share
+    corner: FloatArray  # (S, S)
+    corner_gradient: FloatArray  # (S,)
     cost: float  # Minus twice the log posterior density, up to a constant
     squared_distances: FloatArray  # (M,) squared Mahalanobis distance of each measurement's residual
     weights: FloatArray  # (M,) of the robust loss
@@ -173,12 +173,12 @@ class InertialEquations(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class InertialAnchor:
-    """Gaussian prior on the first knot and the tilt, which may be correlated."""
+    """Gaussian prior on the first knot and on what all knots share, which may be correlated."""
 
     linearisation_point: InertialStates  # One knot about which the error is counted
-    tilt: FloatArray  # (2,) likewise
-    information: FloatArray  # (D + 2, D + 2) inverse covariance of the errors
-    mean: FloatArray  # (D + 2,) of the errors
+    shared: FloatArray  # (S,) likewise
+    information: FloatArray  # (D + S, D + S) inverse covariance of the errors
+    mean: FloatArray  # (D + S,) of the errors
 
 
 def assemble_inertial(
@@ -198,9 +198,9 @@ def assemble_inertial(
     The layout of ``observations`` is from the IMU's origin in its axes. ``kinematics``: angular rate and specific force at
     the knots, (K, 3) each, biases included. ``active`` and ``rejectable``: as without an IMU.
     """
-    count, size = len(knots), knots.dim
+    count, size, shared = len(knots), knots.dim, gravity.dim
     earlier_part, later_part = slice(0, size), slice(size, 2 * size)
-    tilt_part, residual = slice(2 * size, 2 * size + TILT_DIM), 2 * size + TILT_DIM
+    shared_part, residual = slice(2 * size, 2 * size + shared), 2 * size + shared
     linearised = linearise(observations, _as_states(knots, kinematics, gravity, factors), knot_index)
     whitened = by_inertial_states(
         linearised.whitened(observations), gyro_only=not factors.with_accelerometer, dim=size
@@ -209,8 +209,8 @@ def assemble_inertial(
     weights, loss = robust_loss(squared_distances, active=active, rejectable=rejectable)
     diagonal = np.zeros((count, size, size))
     off_diagonal = np.zeros((count - 1, size, size))
-    gradient, border = np.zeros((count, size)), np.zeros((count, size, TILT_DIM))
-    corner, corner_gradient = np.zeros((TILT_DIM, TILT_DIM)), np.zeros(TILT_DIM)
+    gradient, border = np.zeros((count, size)), np.zeros((count, size, shared))
+    corner, corner_gradient = np.zeros((shared, shared)), np.zeros(shared)
     add_measurements(whitened, weights, knot_index, diagonal, gradient)
     cost = float(loss.sum())
     for start in range(0, count - 1, _FACTORS_PER_CHUNK):
@@ -221,7 +221,7 @@ def assemble_inertial(
         normal = np.swapaxes(rows, 1, 2) @ rows
         cost += float(normal[:, residual, residual].sum())
         if steps.odometry is not None:
-            rows = linearise_odometry(some, steps.odometry)
+            rows = linearise_odometry(some, steps.odometry, shared_dim=shared)
             odometry_weights, odometry_loss = robust_loss(dot(rows[:, :, residual], rows[:, :, residual]))
             normal += np.swapaxes(rows * odometry_weights[:, None, None], 1, 2) @ rows
             cost += float(odometry_loss.sum())
@@ -230,18 +230,18 @@ def assemble_inertial(
         off_diagonal[chunk] += normal[:, earlier_part, later_part]
         gradient[chunk] += normal[:, earlier_part, residual]
         gradient[later] += normal[:, later_part, residual]
-        border[chunk] += normal[:, earlier_part, tilt_part]
-        border[later] += normal[:, later_part, tilt_part]
-        corner += normal[:, tilt_part, tilt_part].sum(axis=0)
-        corner_gradient += normal[:, tilt_part, residual].sum(axis=0)
+        border[chunk] += normal[:, earlier_part, shared_part]
+        border[later] += normal[:, later_part, shared_part]
+        corner += normal[:, shared_part, shared_part].sum(axis=0)
+        corner_gradient += normal[:, shared_part, residual].sum(axis=0)
     cost += _add_walks(knots, factors, diagonal, off_diagonal, gradient)
     if factors.odometry is not None:
         cost += add_wheel_processes(knots.wheels, factors.odometry, diagonal, off_diagonal, gradient)
 
     first = knots.select(slice(0, 1)).local_coordinates_about(anchor.linearisation_point)[0]
-    by_error = np.eye(size + TILT_DIM)
+    by_error = np.eye(size + shared)
     by_error[3:6, 3:6] = inverse_right_jacobian(first[3:6])
-    error = np.concatenate([first, gravity.tilt - anchor.tilt]) - anchor.mean
+    error = np.concatenate([first, gravity.shared - anchor.shared]) - anchor.mean
     weighted = by_error.T @ anchor.information
     information, by_anchor = weighted @ by_error, weighted @ error
     diagonal[0] += information[:size, :size]
@@ -266,16 +266,22 @@ def assemble_inertial(
 
 
 def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: InertialFactors) -> FloatArray:
-    """Whitened rows of the K - 1 factors between knots, (K - 1, R, 2 D + 3), but for the walks of the biases.
+    """Whitened rows of the K - 1 factors between knots, (K - 1, R, 2 D + S + 1), but for the walks of the biases.
 
-    Columns: the errors of the earlier state, D, of the later one, D, of the tilt, 2, and the residual. D is 15 without wheel odometry.
+    Columns: the errors of the earlier state, D, of the later one, D, of what they share, S, and the residual. D is 15 without
+    wheel odometry.
     """
     size = knots.dim
-    tilt_part, column = slice(2 * size, 2 * size + TILT_DIM), 2 * size + TILT_DIM
+    tilt_part, column = slice(2 * size, 2 * size + TILT_DIM), 2 * size + gravity.dim
+    matrix_part = slice(tilt_part.stop, column)
     found = factors.preintegrated
     gyro_only = not factors.with_accelerometer
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
     bias = found.accelerometer_bias if gyro_only else earlier.bias_or_acceleration
+    force = np.zeros((len(found), 3))
+    if gravity.matrix.size:
+        force = found.mean_force()
+        bias = bias + gravity.force_error(force)
     position, rotation, velocity = found.corrected(earlier.gyro_bias, bias)
     R_T = np.swapaxes(earlier.rotation, 1, 2)
     turned = R_T @ later.rotation
@@ -290,7 +296,7 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     by_rotation[:, :, column] = residual
     if gyro_only:
         whitened = factors.whitening @ by_rotation
-        return np.concatenate([whitened, _motion_rows(earlier, later, factors)], axis=1)
+        return np.concatenate([whitened, _motion_rows(earlier, later, factors, gravity.dim)], axis=1)
     duration_s = found.duration_s[:, None]
     fall = gravity.vector()
     moved = matvec(
@@ -312,17 +318,21 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     for part in (slice(0, 3), slice(6, 9)):
         rows[:, part, 9:12] = -found.by_gyro_bias[:, part]
         rows[:, part, 12:15] = -found.by_accelerometer_bias[:, part]
+        if gravity.matrix.size:
+            rows[:, part, matrix_part] = -gravity.by_matrix(found.by_accelerometer_bias[:, part], force)
     whitened_rows: FloatArray = factors.whitening @ rows
     return whitened_rows
 
 
-def _motion_rows(earlier: InertialStates, later: InertialStates, factors: InertialFactors) -> FloatArray:
-    """(K - 1, 9, 2 D + 3) whitened rows of the motion prior on position, velocity and acceleration, axis by axis."""
+def _motion_rows(
+    earlier: InertialStates, later: InertialStates, factors: InertialFactors, shared: int
+) -> FloatArray:
+    """(K - 1, 9, 2 D + S + 1) whitened rows of the motion prior on position, velocity and acceleration, axis by axis."""
     assert factors.motion is not None  # noqa: S101 (only called without an accelerometer)
     phi, information = factors.motion
     roots = np.swapaxes(np.linalg.cholesky(information), 2, 3)
     size = earlier.dim
-    rows = np.zeros((len(phi), 9, 2 * size + TILT_DIM + 1))
+    rows = np.zeros((len(phi), 9, 2 * size + shared + 1))
     for axis in range(3):
         own = rows[:, 3 * axis : 3 * axis + 3]
         columns = np.array([axis, 6 + axis, 12 + axis])

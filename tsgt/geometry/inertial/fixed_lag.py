@@ -1,7 +1,7 @@
 """Fixed-lag smoother with an IMU: the trajectory online, in a window of knots that moves with time. Sans-I/O.
 
-As without an IMU: knots older than a few seconds are marginalised into an anchor prior, here on the oldest knot and the tilt of
-gravity, and new measurements are weighed by their normalised innovation squared. The samples between two knots are integrated
+As without an IMU: knots older than a few seconds are marginalised into an anchor prior, here on the oldest knot, the tilt of
+gravity and the accelerometer's matrix, and new measurements are weighed by their normalised innovation squared. The samples between two knots are integrated
 once, and again where a measurement divides them, where samples arrive late, or where the bias of the gyro moves. The start needs
 no pose: docs/explanation/imu.md.
 """
@@ -121,7 +121,10 @@ class InertialFixedLagSmoother(MeasurementWindow):
             else Odometry.of(WheelSamples.none(), odometry, self._mounting, reference_m)
         )
         self._prior, self._gyro_only = prior, prior if gyro_only else None
-        self._initial_gravity = self._gravity = Gravity.of(imu)
+        gravity = Gravity.of(imu)
+        if not gyro_only:
+            gravity = gravity.with_matrix(imu.noise.accelerometer_scale_misalignment, mounting.rotation[2])
+        self._initial_gravity = self._gravity = gravity
         self._health = HealthMonitor(imu)
         self._samples: InertialSamples | None = None
         self._rotation_predictor = RotationPredictor()
@@ -307,7 +310,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         return covariance
 
     def _window_displacement(self) -> tuple[FloatArray, FloatArray] | None:
-        """Displacement of the knots and the tilt by the set-up, computed once per solution; None: unknown."""
+        """Displacement of the knots and of what they share by the set-up, computed once per solution; None: unknown."""
         if self._sensitivity is not None and self._displacement is None:
             assert self._solved is not None  # noqa: S101 (only called while initialised)
             self._displacement = self._sensitivity.displacement(self._solved.linearised, self._solved.factor)
@@ -447,9 +450,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
         )
         for _ in range(MAX_STEPS):
             factor = _factorise(system)
-            step, tilt = factor.solve(-system.gradient, -system.corner_gradient)
-            gain = -float(np.vdot(step, system.gradient) + np.vdot(tilt, system.corner_gradient))
-            knots, gravity = knots.retract(step), replace(gravity, tilt=gravity.tilt + tilt)
+            step, shared = factor.solve(-system.gradient, -system.corner_gradient)
+            gain = -float(np.vdot(step, system.gradient) + np.vdot(shared, system.corner_gradient))
+            knots, gravity = knots.retract(step), gravity.retract(shared)
             if gain < COST_TOLERANCE or (np.all(weights == 1.0) and is_below_step_tolerance(step)):
                 self._window = replace(window, knots=knots)
                 outliers = self._accept(
@@ -590,16 +593,16 @@ class InertialFixedLagSmoother(MeasurementWindow):
             rejectable=np.ones(int(is_past.sum()), np.bool_),
         )
         factor = _factorise(system)
-        step, tilt = factor.solve(-system.gradient, -system.corner_gradient)
+        step, shared = factor.solve(-system.gradient, -system.corner_gradient)
         if self._sensitivity is not None:
             linearised = system.linearised, system.weights, knot_index[is_past]
             solved = Linearised(past, *linearised, window.anchor, self._anchor_displacement)
             self._anchor_displacement = self._sensitivity.at_last(solved, factor)
         anchor = InertialAnchor(
             window.knots.select(slice(first, first + 1)),
-            self._gravity.tilt,
+            self._gravity.shared,
             factor.last_information(),
-            np.concatenate([step[first], tilt]),
+            np.concatenate([step[first], shared]),
         )
         self._window = replace(window.select(slice(first, None)), anchor=anchor)
 

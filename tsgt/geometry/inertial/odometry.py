@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.inertial.states import TILT_DIM, WHEELS_DIM
+from tsgt.geometry.inertial.states import WHEELS_DIM
 from tsgt.geometry.rigid import FloatArray, dot, exp_so3, matvec, rotation_from_quaternion, skew
 from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
 
@@ -224,8 +224,8 @@ def rejected_steps(residuals: FloatArray) -> NDArray[np.bool_]:
     return dot(residuals, residuals) > OUTLIER_THRESHOLD**2
 
 
-def linearise_odometry(knots: InertialStates, steps: OdometrySteps) -> FloatArray:
-    """Whitened rows of the K - 1 steps between knots, (K - 1, 3, 2 D + 3): in columns as those of the other factors."""
+def linearise_odometry(knots: InertialStates, steps: OdometrySteps, *, shared_dim: int = 0) -> FloatArray:
+    """Whitened rows of the K - 1 steps between knots, (K - 1, 3, 2 D + S + 1): in columns as those of the other factors."""
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
     size = knots.dim
     R_T = np.swapaxes(earlier.rotation, 1, 2)
@@ -235,7 +235,7 @@ def linearise_odometry(knots: InertialStates, steps: OdometrySteps) -> FloatArra
     mean = 0.5 * (earlier.wheels + later.wheels)
     scale, direction = 1.0 + mean[:, 0] + mean[:, 1], mean[:, 2]
     along = steps.forward_m + direction[:, None] * steps.leftward_m
-    rows = np.zeros((len(steps), 3, 2 * size + TILT_DIM + 1))
+    rows = np.zeros((len(steps), 3, 2 * size + shared_dim + 1))
     rows[:, :, 0:3], rows[:, :, 3:6] = -R_T, skew(end)
     rows[:, :, size : size + 3], rows[:, :, size + 3 : size + 6] = R_T, -turned @ skew(steps.arm_m)
     by_wheels = np.stack([along, along, scale[:, None] * steps.leftward_m], axis=2)

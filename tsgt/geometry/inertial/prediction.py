@@ -48,10 +48,10 @@ _POSE_DIM = 6
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """A predicted state; errors are those of the state and of the tilt."""
+    """A predicted state; errors are those of the state and of what all states share."""
 
     state: InertialStates  # One
-    gravity: Gravity  # With the tilt
+    gravity: Gravity
     covariance: FloatArray  # (D + 2, D + 2)
     by_start: FloatArray  # (D + 2, D + 2) by the error of the newest knot
     wheels_rejected: bool | None = (
@@ -64,7 +64,7 @@ class _Link:
 
 
 class StrapdownPredictor:
-    """Predicts from one state of the IMU, with the (D + 2, D + 2) covariance of its error and of the tilt's.
+    """Predicts from one state of the IMU, with the (D + S, D + S) covariance of its error and of what all states share.
 
     ``motion`` is the prior beyond the last sample; ``gyro_only``: for positions everywhere. ``rotation_predictor``: what has learnt from
     the samples how the robot is shaken.
@@ -143,7 +143,7 @@ class StrapdownPredictor:
     def by_start(
         self, time_s: float, samples: InertialSamples, odometry: Odometry | None = None
     ) -> FloatArray:
-        """(6, D + 2) Jacobian of the pose's error at a time by the error of the newest knot and of the tilt."""
+        """(6, D + S) Jacobian of the pose's error at a time by the error of the newest knot and of what all share."""
         end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
         link = self._at(end_s, samples, odometry)
         onward_s = time_s - end_s
@@ -225,7 +225,7 @@ class StrapdownPredictor:
         covariance -= gain @ mixed.T
         return _Link(
             moved.retract(error[None, :size]),
-            replace(link.gravity, tilt=link.gravity.tilt + error[size:]),
+            link.gravity.retract(error[size:]),
             0.5 * (covariance + covariance.T),
             by_start - gain @ by_both @ link.by_start,
             wheels_rejected=False if known else None,
@@ -234,14 +234,18 @@ class StrapdownPredictor:
     def _integrated(
         self, state: InertialStates, gravity: Gravity, motion: Preintegrated
     ) -> tuple[InertialStates, FloatArray, FloatArray]:
-        """State after a motion, Jacobian of its error, and covariance of the samples' noise, (D + 2, D + 2) each."""
+        """State after a motion, Jacobian of its error, and covariance of the samples' noise, (D + S, D + S) each."""
         found = strapdown(state, gravity, motion)
         step_s = float(motion.duration_s[0])
         by_start, noise = np.eye(self._dim), np.zeros((self._dim, self._dim))
         by_start[0:9, :INERTIAL_STATE_DIM] = found.by_start[0]
         by_tilt = gravity.by_tilt()
-        by_start[0:3, -TILT_DIM:] = 0.5 * step_s**2 * by_tilt
-        by_start[6:9, -TILT_DIM:] = step_s * by_tilt
+        tilt_part = slice(state.dim, state.dim + TILT_DIM)
+        by_start[0:3, tilt_part] = 0.5 * step_s**2 * by_tilt
+        by_start[6:9, tilt_part] = step_s * by_tilt
+        if gravity.matrix.size:
+            by_bias = found.by_start[:, :, 12:15]
+            by_start[0:9, tilt_part.stop :] = gravity.by_matrix(by_bias, motion.mean_force())[0]
         noise[0:9, 0:9] = found.noise[0]
         moved = replace(state, position=found.position, rotation=found.rotation, velocity=found.velocity)
         return moved, by_start, noise
@@ -291,7 +295,7 @@ class StrapdownPredictor:
         onward_s: float,
         turning: PredictedRotation | None,
     ) -> tuple[States, FloatArray]:
-        """State of the reference point, with rate and acceleration by the samples, and its Jacobian, (18, D + 2).
+        """State of the reference point, with rate and acceleration by the samples, and its Jacobian, (18, D + S).
 
         ``onward_s``: how long to go on with it beyond the last sample, with the predicted rate if there is one.
         """

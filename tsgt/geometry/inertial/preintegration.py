@@ -129,6 +129,12 @@ class Preintegrated:
         """Return the motions over some intervals."""
         return Preintegrated(*(getattr(self, each.name)[rows] for each in fields(self)))
 
+    def mean_force(self) -> FloatArray:
+        """(K, 3) mean specific force, in the turning axes of the IMU, without the bias that was subtracted."""
+        # An interval may have no length.
+        integral = 1e-12 * np.eye(3) - self.by_accelerometer_bias[:, 6:9]
+        return matvec(np.asarray(np.linalg.inv(integral), np.float64), self.velocity)
+
     def corrected(
         self, gyro_bias: FloatArray, accelerometer_bias: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

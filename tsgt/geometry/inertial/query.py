@@ -50,7 +50,10 @@ class Predicted(NamedTuple):
 
 def strapdown(start: InertialStates, gravity: Gravity, motion: Preintegrated) -> Predicted:
     """Propagate N states by motions that begin at their times; biases are those of the states, to first order."""
-    delta_p, delta_R, delta_v = motion.corrected(start.gyro_bias, start.bias_or_acceleration)
+    bias = start.bias_or_acceleration
+    if gravity.matrix.size:
+        bias = bias + gravity.force_error(motion.mean_force())
+    delta_p, delta_R, delta_v = motion.corrected(start.gyro_bias, bias)
     R, duration_s = start.rotation, motion.duration_s[:, None]
     fall = gravity.vector()
     by_start = np.zeros((len(start), 9, INERTIAL_STATE_DIM))

@@ -1,7 +1,7 @@
 """What the measurements' residuals and the set-up's errors say about a trajectory with an IMU. Sans-I/O.
 
 The set-up's error displaces the states by ``-H^-1 C`` as without an IMU (``geometry.trajectory.sensitivity``); the tilt of
-gravity, which borders H, takes part of it. In a window that moves with time the mean of the anchor prior moves with the set-up.
+gravity and the accelerometer's matrix, which border H, take part of it. In a window that moves with time the mean of the anchor prior moves with the set-up.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.geometry.inertial.factors import by_inertial_states
-from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,17 +35,17 @@ class Linearised(NamedTuple):
     weights: FloatArray
     knot_index: NDArray[np.intp]
     anchor: InertialAnchor | None = None  # That depends on the set-up
-    anchor_displacement: FloatArray | None = None  # (D + 2, r) of its mean
+    anchor_displacement: FloatArray | None = None  # (D + S, r) of its mean
 
 
 class InertialSensitivity:
-    """Displacement of states and tilt by the set-up's errors, in the columns of a factor of their covariance."""
+    """Displacement of states and of what they share by the set-up's errors, in the columns of a factor of their covariance."""
 
     def __init__(self, setup_jacobian: SetupJacobian, mounting: Mounting, *, gyro_only: bool) -> None:
         self._by_setup, self._mounting, self._gyro_only = setup_jacobian, mounting, gyro_only
 
     def displacement(self, solved: Linearised, factor: BorderedCholesky) -> tuple[FloatArray, FloatArray]:
-        """(K, D, r) displacement of K knots, and (2, r) of the tilt."""
+        """(K, D, r) displacement of K knots, and (S, r) of what they share."""
         observations, linearised, weights, knot_index, anchor, anchor_displacement = solved
         # Prisms are uncertain along the axes of the robot.
         of_robot = replace(linearised, rotation=linearised.rotation @ self._mounting.rotation.T)
@@ -57,7 +57,7 @@ class InertialSensitivity:
         np.add.at(
             mixed[:, :INERTIAL_STATE_DIM], knot_index, np.swapaxes(jacobian, 1, 2) @ (information @ by_setup)
         )
-        shared = np.zeros((TILT_DIM, by_setup.shape[2]))
+        shared = np.zeros((factor.border.shape[2], by_setup.shape[2]))
         if anchor is not None and anchor_displacement is not None:
             by_anchor = anchor.information @ anchor_displacement
             mixed[0] -= by_anchor[:size]
@@ -66,7 +66,7 @@ class InertialSensitivity:
         return -displaced, -shared_displaced
 
     def at_last(self, solved: Linearised, factor: BorderedCholesky) -> FloatArray:
-        """(D + 2, r) displacement of the last knot and the tilt: that of the anchor prior on it."""
+        """(D + S, r) displacement of the last knot and what all share: that of the anchor prior on it."""
         states, shared = self.displacement(solved, factor)
         return np.concatenate([states[-1], shared])
 

@@ -23,6 +23,7 @@ from tsgt.geometry.inertial.sensitivity import residual_variances, setup_displac
 from tsgt.geometry.inertial.solver import InertialSetup, inertial_knot_times, solve_inertial
 from tsgt.geometry.inertial.states import (
     INERTIAL_STATE_DIM,
+    TILT_DIM,
     Gravity,
     InertialStates,
     Mounting,
@@ -46,13 +47,18 @@ if TYPE_CHECKING:
 
 SEGMENT_S = 240.0  # Over which the gyro turns by a few degrees more than it says
 OVERLAP_S = 40.0  # On either side of a segment, solved with it and discarded
+ALONE_SEGMENTS = 8
+"""Segments that are solved together once more where one prism was measured: it tells the heading in motion alone, so that a segment
+in which the robot stands needs what comes before and after.
+"""
 START_GROWTH = 4.0  # Factor on the length that is solved from one start to the next, until it is a segment
 FIRST_SEARCH_S, LONGEST_SEARCH_S = 10.0, 80.0
 """Length of measurements that the search over headings takes, doubled while they do not tell the heading."""
 
-ANGULAR_RATE_DENSITY, SPECIFIC_FORCE_DENSITY = 0.48, 0.71
-"""Of a driving robot, below 0.1 Hz, all axes together, in rad/s/sqrt(Hz) and m/s^2/sqrt(Hz): scenario ``dynamic``; 0.04 to 0.11 and 0.50 to
-0.64 on ``quarry``, ``ski-trail`` and ``snowmobile``. An error of the sensor's matrix times these is noise to the estimator.
+ANGULAR_RATE_DENSITY, VERTICAL_FORCE_DENSITY = 0.48, 0.05
+"""Of a driving robot, in rad/s/sqrt(Hz) below 0.1 Hz, all axes together, and in m/s^2/sqrt(Hz) below 1 Hz: scenario ``dynamic``; the rates of
+``quarry``, ``ski-trail`` and ``snowmobile`` are 0.04 to 0.11. An error of the sensor's matrix times these is noise to the estimator; that
+by forces across the vertical is estimated.
 """
 NOMINAL_GRAVITY_MPS2 = 9.81
 EARTH_RATE_WALK, CORIOLIS_WALK = 1.6e-5, 6e-5
@@ -92,7 +98,7 @@ def estimation_noise(noise: ImuNoise) -> ImuNoise:
     of_accelerometer = noise.accelerometer_scale_misalignment
     terms = {
         "gyro_noise_density": ANGULAR_RATE_DENSITY * noise.gyro_scale_misalignment,
-        "accelerometer_noise_density": SPECIFIC_FORCE_DENSITY * of_accelerometer,
+        "accelerometer_noise_density": VERTICAL_FORCE_DENSITY * of_accelerometer,
         "gyro_bias_walk": EARTH_RATE_WALK,
         "accelerometer_bias_walk": CORIOLIS_WALK,
         "accelerometer_bias_mps2": NOMINAL_GRAVITY_MPS2 * of_accelerometer,
@@ -135,21 +141,30 @@ def fit_inertial_trajectory(
         contiguous(samples, noise, start_s=float(time_s[0]), end_s=float(time_s[-1])), noise, gyro_only
     )
     wheels = None if odometry is None else Odometry.of(*odometry, of_states, reference_m)
-    near, gravity = find_start(mounted, setup, Gravity.of(imu))
+    prior = Gravity.of(imu)
+    if gyro_only is None:
+        prior = prior.with_matrix(imu.noise.accelerometer_scale_misalignment, mounting.rotation[2])
+    near, gravity = find_start(mounted, setup, prior)
     count = max(round(float(time_s[-1] - time_s[0]) / SEGMENT_S), 1)
     edges_s = np.linspace(time_s[0], time_s[-1], count + 1)
     ends = [0, *np.searchsorted(time_s, edges_s[1:-1]).tolist(), len(time_s)]
     knot_index = nearest_knots(time_s, mounted.time_s)
 
     def solve(
-        start_s: float, end_s: float, near: InertialStates
+        start_s: float, end_s: float, near: InertialStates | None, guess: InertialStates | None = None
     ) -> tuple[InertialSolution, Observations, int]:
+        """Solve a stretch from states close to it, or from a guess of all states."""
         solved = slice(*np.searchsorted(time_s, (start_s, np.nextafter(end_s, np.inf))))
         rows = slice(*np.searchsorted(knot_index, (solved.start, solved.stop)))
         some = mounted.select(rows)
-        guess, preintegrated = extended(near, time_s[solved], some, setup)
-        if wheels is not None:
-            guess = guess.with_wheels()
+        preintegrated = None
+        if guess is not None:
+            guess = guess.select(solved)
+        else:
+            assert near is not None  # noqa: S101 (one of both)
+            guess, preintegrated = extended(near, time_s[solved], some, setup)
+            if wheels is not None:
+                guess = guess.with_wheels()
         factors = InertialFactors.between(
             setup.samples,
             guess.select(slice(None, -1)),
@@ -176,12 +191,21 @@ def fit_inertial_trajectory(
         solution, some, offset = solve(edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near)
         kept = slice(ends[number] - offset, ends[number + 1] - offset)
         parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian)
-    report_progress(1.0)
     ordered = [parts[number] for number in range(count)]
-    middle = ordered[count // 2]
+    if count > 1 and len(np.unique(mounted.prism)) == 1:
+        ordered = []
+        guess = concatenate_inertial_states([parts[number].knots for number in range(count)])
+        for begin in range(0, count, ALONE_SEGMENTS):
+            end = min(begin + ALONE_SEGMENTS, count)
+            margins_s = edges_s[begin] - SEGMENT_S, edges_s[end] + SEGMENT_S
+            solution, some, offset = solve(*margins_s, None, guess)
+            kept = slice(ends[begin] - offset, ends[end] - offset)
+            ordered.append(_Part.of(solution, some, kept, of_states, setup_jacobian))
+    report_progress(1.0)
+    middle = ordered[len(ordered) // 2]
     trajectory = InertialTrajectory(
         concatenate_inertial_states([part.knots for part in ordered]),
-        replace(gravity, tilt=middle.tilt),
+        middle.gravity,
         setup.samples,
         of_states,
         np.concatenate([part.covariance for part in ordered]),
@@ -221,7 +245,7 @@ class _Part:
     weights: FloatArray
     residual_variances_m2: FloatArray
     displacement: FloatArray | None
-    tilt: FloatArray
+    gravity: Gravity
     tilt_sigma_rad: float
     wheels: WheelsFit | None
 
@@ -251,8 +275,8 @@ class _Part:
             solution.weights[rows],
             residual_variances(solution, observations, covariance)[rows],
             displacement,
-            solution.gravity.tilt,
-            float(np.sqrt(np.diag(solution.factor.shared_covariance).max())),
+            solution.gravity,
+            float(np.sqrt(np.diag(solution.factor.shared_covariance)[:TILT_DIM].max())),
             _wheels(solution, whole, kept),
         )
 

@@ -1,7 +1,7 @@
 """Maximum a posteriori trajectory with an IMU, by Gauss-Newton on states at knots. Sans-I/O.
 
 The search and the treatment of outliers are those of ``geometry.trajectory.gauss_newton``; what differs are the factors between
-knots, the tilt of gravity, which borders the system, and the integration of the samples, which is repeated where the bias of the
+knots, the tilt of gravity and the accelerometer's matrix, which border the system, and the integration of the samples, which is repeated where the bias of the
 gyro has moved.
 """
 
@@ -19,7 +19,6 @@ from tsgt.geometry.inertial.factors import (
     InertialFactors,
     assemble_inertial,
 )
-from tsgt.geometry.inertial.states import TILT_DIM, Gravity, InertialStates
 from tsgt.geometry.rigid import dot
 from tsgt.geometry.trajectory.gauss_newton import (
     COARSE_NOISE_SCALES,
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.inertial.odometry import Odometry
     from tsgt.geometry.inertial.preintegration import ContiguousSamples
+    from tsgt.geometry.inertial.states import Gravity, InertialStates
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
     from tsgt.model import ImuNoise, MotionPrior
@@ -112,7 +112,7 @@ def diffuse_inertial_prior(
     gyro_only: MotionPrior | None = None,
     odometry: Odometry | None = None,
 ) -> InertialAnchor:
-    """Prior on the first knot that carries next to no information, but for the biases, and on the tilt."""
+    """Prior on the first knot that carries next to no information, but for the biases, and on what all knots share."""
     of_last = (
         np.full(3, noise.accelerometer_bias_mps2) if gyro_only is None else gyro_only.acceleration_sigma_mps2
     )
@@ -124,7 +124,7 @@ def diffuse_inertial_prior(
             np.full(3, noise.gyro_bias_radps),
             of_last,
             np.empty(0) if odometry is None else odometry.prior_sigmas(),
-            np.full(TILT_DIM, max(gravity.tilt_sigma_rad, 1e-9)),
+            gravity.prior_sigmas(),
         ]
     )
     zero = np.zeros((1, 3))
@@ -135,14 +135,17 @@ def diffuse_inertial_prior(
         bias_or_acceleration=zero,
         wheels=np.zeros_like(first.wheels),
     )
-    return InertialAnchor(about, np.zeros(TILT_DIM), np.diag(sigmas**-2.0), np.zeros(len(sigmas)))
+    return InertialAnchor(about, np.zeros(gravity.dim), np.diag(sigmas**-2.0), np.zeros(len(sigmas)))
 
 
 def anchor_at_end(solution: InertialSolution) -> InertialAnchor:
     """Prior on the last knot of a solution that contains all that its measurements and its anchor say."""
     information = solution.factor.last_information()
     return InertialAnchor(
-        solution.knots.select(slice(-1, None)), solution.gravity.tilt, information, np.zeros(len(information))
+        solution.knots.select(slice(-1, None)),
+        solution.gravity.shared,
+        information,
+        np.zeros(len(information)),
     )
 
 
@@ -160,7 +163,7 @@ def solve_inertial(
     """Find the maximum a posteriori trajectory from observations in any order.
 
     ``observations``: with the layout in the IMU's axes, from its origin. ``guess``: states at the knot times of the result,
-    rotations within about half a radian of the solution. ``anchor``: prior on the first knot and the tilt; diffuse when not
+    rotations within about half a radian of the solution. ``anchor``: prior on the first knot and what all knots share; diffuse when not
     given. ``factors``: between the knots of the guess, when they are at hand. Raises GeometryError: the measurements do not
     determine the trajectory.
     """
@@ -212,16 +215,16 @@ class _Search:
         factor = _factorise(system)
         while iterations < max_iterations:
             iterations += 1
-            step, tilt = factor.solve(-system.gradient, -system.corner_gradient)
-            gain = -float(np.vdot(step, system.gradient) + np.vdot(tilt, system.corner_gradient))
+            step, shared = factor.solve(-system.gradient, -system.corner_gradient)
+            gain = -float(np.vdot(step, system.gradient) + np.vdot(shared, system.corner_gradient))
             if gain < PREDICTED_GAIN_TOLERANCE:
-                knots, gravity = knots.retract(step), replace(gravity, tilt=gravity.tilt + tilt)
+                knots, gravity = knots.retract(step), gravity.retract(shared)
                 system = apply_linear_step(system, self.knot_index, step, gain)
                 break
             fraction = 1.0
             while fraction > MIN_STEP_FRACTION:
                 moved = knots.retract(fraction * step)
-                moved_gravity = replace(gravity, tilt=gravity.tilt + fraction * tilt)
+                moved_gravity = gravity.retract(fraction * shared)
                 candidate = self._evaluate(moved, moved_gravity, factors)
                 if candidate.cost < system.cost - 0.1 * fraction * gain:
                     break

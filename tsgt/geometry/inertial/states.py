@@ -1,4 +1,4 @@
-"""States of an IMU at knots, and what is common to all of them: mounting and gravity. Sans-I/O.
+"""States of an IMU at knots, and what is common to all of them: mounting, gravity, the accelerometer's matrix. Sans-I/O.
 
 The error (local coordinates) of a state has 15 components, three each of: position of the IMU's origin (frame ``station1``),
 rotation (about its own axes, ``R Exp(d)``), velocity (``station1``), bias of the gyro (its axes), and bias of the accelerometer
@@ -8,7 +8,7 @@ slip, and the direction of travel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -121,17 +121,64 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class Gravity:
-    """Gravity in frame ``station1``, whose z axis is vertical up to a tilt that all states share."""
+    """Gravity in frame ``station1``, and how the accelerometer measures against it: what all states share.
+
+    The z axis of ``station1`` is vertical up to a tilt. The accelerometer measures a force along each of H directions, those across
+    the vertical, with an error in proportion to it: its scale and the alignment of its axes. Along the vertical, where the force hardly
+    changes, that error is part of the bias. The error (local coordinates) has 2 + 3 H components: of tilt and ``matrix``.
+    """
 
     magnitude_mps2: float
     tilt_sigma_rad: float  # One sigma of each component of the tilt
     # (2,) rotation vector about the axes x and y of ``station1`` that takes its z axis to the vertical, rad
     tilt: FloatArray
+    # (3, H) what a unit force along each direction adds to what is measured, in the axes of the IMU
+    matrix: FloatArray = field(default_factory=lambda: np.zeros((3, 0)))
+    directions: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (H, 3) unit vectors
+    matrix_sigma: float = 0.0  # One sigma of each component of that matrix
 
     @classmethod
     def of(cls, imu: ImuParameters) -> Gravity:
         """Return gravity along the z axis."""
         return cls(imu.gravity_mps2, imu.tilt_sigma_rad, np.zeros(TILT_DIM))
+
+    def with_matrix(self, sigma: float, vertical: FloatArray) -> Gravity:
+        """Return it with an unknown matrix; ``vertical``: (3,) the robot's z axis in the axes of the IMU."""
+        first = np.cross(np.eye(3)[int(np.argmin(np.abs(vertical)))], vertical)
+        first /= np.linalg.norm(first)
+        directions = np.stack([first, np.cross(vertical, first)])
+        return replace(self, matrix=np.zeros((3, 2)), directions=directions, matrix_sigma=sigma)
+
+    @property
+    def dim(self) -> int:
+        """Components of an error."""
+        return TILT_DIM + int(self.matrix.size)
+
+    @property
+    def shared(self) -> FloatArray:
+        """(S,) tilt and matrix: the error about zero."""
+        return np.concatenate([self.tilt, self.matrix.ravel()])
+
+    def retract(self, error: FloatArray) -> Gravity:
+        """Add an error, (S,)."""
+        matrix = self.matrix + error[TILT_DIM:].reshape(self.matrix.shape)
+        return replace(self, tilt=self.tilt + error[:TILT_DIM], matrix=matrix)
+
+    def prior_sigmas(self) -> FloatArray:
+        """(S,) one sigma of each component of the error."""
+        of_tilt = np.full(TILT_DIM, max(self.tilt_sigma_rad, 1e-9))
+        return np.concatenate([of_tilt, np.full(self.matrix.size, max(self.matrix_sigma, 1e-9))])
+
+    def force_error(self, force: FloatArray) -> FloatArray:
+        """Return what the matrix adds to specific forces, (K, 3) each, like a bias."""
+        found: FloatArray = (force @ self.directions.T) @ self.matrix.T
+        return found
+
+    def by_matrix(self, by_bias: FloatArray, force: FloatArray) -> FloatArray:
+        """(K, N, 3 H) Jacobian by the matrix from that by the accelerometer's bias, (K, N, 3), and the specific forces, (K, 3)."""
+        along = force @ self.directions.T
+        found = by_bias[:, :, :, None] * along[:, None, None, :]
+        return found.reshape(*by_bias.shape[:2], self.matrix.size)
 
     def vector(self) -> FloatArray:
         """(3,) acceleration of a falling body in frame ``station1``, m/s^2."""

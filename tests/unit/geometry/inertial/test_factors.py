@@ -50,39 +50,35 @@ def example(rng: np.random.Generator) -> tuple[ContiguousSamples, InertialStates
         rng.normal(scale=1e-2, size=(COUNT, 3)),
         np.empty((COUNT, 0)),
     )
-    return (
-        contiguous(samples, NOISE),
-        states,
-        replace(Gravity(9.81, 1e-3, np.zeros(2)), tilt=np.array([0.02, -0.03])),
-    )
+    gravity = Gravity(9.81, 1e-3, np.zeros(2)).with_matrix(7e-3, np.array([0.1, -0.3, 0.95]))
+    return contiguous(samples, NOISE), states, gravity.retract(rng.normal(scale=0.02, size=8))
 
 
 @pytest.mark.parametrize("prior", [None, MotionPrior()], ids=["accelerometer", "gyro_only"])
 def test_rows_equal_differences(prior: MotionPrior | None) -> None:
-    """Jacobians by both states and by the tilt, of whitened residuals of order one to thousands."""
+    """Jacobians by both states and by what they share, of whitened residuals of order one to thousands."""
     samples, states, gravity = example(np.random.default_rng(0))
     factors = InertialFactors.of(samples, states, NOISE, gyro_only=prior)
     rows = linearise_inertial(states, gravity, factors)
-    scale = np.abs(rows[:, :, :32]).max(axis=2, keepdims=True)
+    scale = np.abs(rows[:, :, :38]).max(axis=2, keepdims=True)
 
-    def residuals(error: FloatArray, tilt: FloatArray) -> FloatArray:
-        moved = replace(gravity, tilt=gravity.tilt + tilt)
-        return linearise_inertial(states.retract(error), moved, factors)[:, :, 32]
+    def residuals(error: FloatArray, shared: FloatArray) -> FloatArray:
+        return linearise_inertial(states.retract(error), gravity.retract(shared), factors)[:, :, 38]
 
     h, zero = 1e-6, np.zeros((COUNT, 15))
     for column in range(15):
         for knot in range(COUNT):
             error = zero.copy()
             error[knot, column] = h
-            numerical = (residuals(error, np.zeros(2)) - residuals(-error, np.zeros(2))) / (2 * h)
+            numerical = (residuals(error, np.zeros(8)) - residuals(-error, np.zeros(8))) / (2 * h)
             for step in range(COUNT - 1):
                 expected = rows[step, :, 15 * (knot - step) + column] if knot - step in (0, 1) else 0.0
                 np.testing.assert_allclose(
                     numerical[step] / scale[step, :, 0], expected / scale[step, :, 0], atol=2e-6
                 )
-    for column in range(2):
-        tilt = h * np.eye(2)[column]
-        numerical = (residuals(zero, tilt) - residuals(zero, -tilt)) / (2 * h)
+    for column in range(8):
+        shared = h * np.eye(8)[column]
+        numerical = (residuals(zero, shared) - residuals(zero, -shared)) / (2 * h)
         np.testing.assert_allclose(
             numerical / scale[:, :, 0], rows[:, :, 30 + column] / scale[:, :, 0], atol=2e-6
         )
@@ -113,37 +109,37 @@ def test_gradient_equals_differences_of_the_cost(prior: MotionPrior | None) -> N
         np.eye(4)[None],
         layout,
     )
-    square = rng.normal(size=(17, 17))
+    square = rng.normal(size=(23, 23))
     anchor = InertialAnchor(
         states.select(slice(0, 1)).retract(rng.normal(scale=0.01, size=(1, 15))),
-        np.array([0.01, 0.01]),
+        np.full(8, 0.01),
         square @ square.T,
-        rng.normal(scale=0.01, size=17),
+        rng.normal(scale=0.01, size=23),
     )
     kinematics = samples.at(states.time_s)
 
-    def at(error: FloatArray, tilt: FloatArray) -> InertialEquations:
-        moved = replace(gravity, tilt=gravity.tilt + tilt)
+    def at(error: FloatArray, shared: FloatArray) -> InertialEquations:
+        moved = gravity.retract(shared)
         return assemble_inertial(
             observations, knot_index, states.retract(error), kinematics, moved, factors, anchor
         )
 
     zero = np.zeros((COUNT, 15))
-    system = at(zero, np.zeros(2))
+    system = at(zero, np.zeros(8))
     h = 1e-6
     numerical = np.empty((COUNT, 15))
     for knot in range(COUNT):
         for column in range(15):
             error = zero.copy()
             error[knot, column] = h
-            numerical[knot, column] = (at(error, np.zeros(2)).cost - at(-error, np.zeros(2)).cost) / (4 * h)
+            numerical[knot, column] = (at(error, np.zeros(8)).cost - at(-error, np.zeros(8)).cost) / (4 * h)
     scale = np.sqrt(np.einsum("kii->ki", system.diagonal))
     np.testing.assert_allclose(
         numerical / scale, system.gradient / scale, atol=2e-3 * np.abs(system.gradient / scale).max()
     )
     h = 1e-3
-    by_tilt = [(at(zero, h * each).cost - at(zero, -h * each).cost) / (4 * h) for each in np.eye(2)]
-    np.testing.assert_allclose(by_tilt, system.corner_gradient, rtol=2e-3)
+    by_shared = [(at(zero, h * each).cost - at(zero, -h * each).cost) / (4 * h) for each in np.eye(8)]
+    np.testing.assert_allclose(by_shared, system.corner_gradient, rtol=2e-3)
 
 
 def test_gravity_is_tilted() -> None:

@@ -6,5 +6,18 @@ that cannot be used raises one line.
 
 from tsgt.analysis.formats.trajectories.columns import TextFormat
 from tsgt.analysis.formats.trajectories.estimates import read_estimates
+from tsgt.analysis.formats.trajectories.reference_files import (
+    is_measured,
+    is_recording,
+    read_reference_poses,
+    reference_of_poses,
+)
 
-__all__ = ["TextFormat", "read_estimates"]
+__all__ = [
+    "TextFormat",
+    "is_measured",
+    "is_recording",
+    "read_estimates",
+    "read_reference_poses",
+    "reference_of_poses",
+]

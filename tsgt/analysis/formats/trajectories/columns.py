@@ -11,7 +11,7 @@ from tsgt.errors import InputFileError, quoted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.analysis.formats.trajectories.number_table import NumberTable, TimeUnit
+    from tsgt.analysis.formats.number_table import NumberTable, TimeUnit
 
 TextFormat = Literal["tum", "kitti", "euroc", "csv"]
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.formats.number_table import joined_times_ns, read_number_table, times_ns
 from tsgt.analysis.formats.trajectories.columns import KITTI_COLUMNS, pose_columns
-from tsgt.analysis.formats.trajectories.number_table import joined_times_ns, read_number_table, times_ns
 from tsgt.analysis.formats.trajectories.raw import RawTrajectory
 from tsgt.errors import InputFileError
 from tsgt.geometry import quaternion_from_rotation
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tsgt.analysis.formats.number_table import NumberTable
     from tsgt.analysis.formats.trajectories.columns import TextFormat
-    from tsgt.analysis.formats.trajectories.number_table import NumberTable
     from tsgt.geometry import FloatArray
 
 _ROTATION_TOLERANCE = 1e-2  # Of R^T R from the identity: matrices are written with a few digits

@@ -4,6 +4,8 @@ Comes in: reference poses with covariance, estimates of other programs (poses or
 of their own point on the robot). Goes out: time offset, extrinsic and frame with uncertainties, and error statistics.
 """
 
+from tsgt.analysis.compare.fitting import ExtrinsicPrior, FitSettings, fit, nested_fits
+from tsgt.analysis.compare.initialisation import overlap_s
 from tsgt.analysis.compare.pairing import PairedPoses, pair
 from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation, initial_relation
 from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
@@ -11,11 +13,16 @@ from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
 __all__ = [
     "Alignment",
     "Estimate",
+    "ExtrinsicPrior",
     "Fit",
+    "FitSettings",
     "FittedPart",
     "PairedPoses",
     "ReferencePoses",
     "Relation",
+    "fit",
     "initial_relation",
+    "nested_fits",
+    "overlap_s",
     "pair",
 ]

@@ -1,0 +1,463 @@
+"""The joint fit of what stands between an estimate and the reference, with uncertainties that allow for drift."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.analysis.compare.drifting_frame import (
+    NAMES,
+    Noise,
+    Rows,
+    Solved,
+    Unknowns,
+    all_rows,
+    linearise,
+    robust_weight,
+    rows_of,
+    solve,
+    start_states,
+)
+from tsgt.analysis.compare.frame_alignment import FRAME_NAMES, align_frame, drift_covariance
+from tsgt.analysis.compare.initialisation import (
+    estimate_motion,
+    extrinsic_rotation,
+    offset_by_correlation,
+    rotation_between,
+)
+from tsgt.analysis.compare.interpolation import ReferenceTrajectory
+from tsgt.analysis.compare.noise import estimate_noise
+from tsgt.analysis.compare.pairing import on_reference_clock
+from tsgt.analysis.compare.reference_error import CORRELATION_S as REFERENCE_CORRELATION_S
+from tsgt.analysis.compare.reference_error import at_sensor, own_covariance, whiten
+from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation, initial_relation
+from tsgt.geometry import exp_so3, log_so3, rotate, transform_from
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
+    from tsgt.geometry import FloatArray
+
+MIN_STEP_S = 0.04
+MAX_ROWS = 15_000
+"""Poses of an estimate that a fit uses: at 25 Hz what its errors share outweighs what more poses add."""
+
+NOISE_PASSES = 3
+MAX_ITERATIONS = 20
+CONVERGED_SIGMAS = 1e-3
+
+OBSERVABLE_SIGMA = dict(zip(NAMES, [0.05, 1e-3, 0.1, *[0.05] * 3, *[math.radians(1.0)] * 3], strict=True))
+"""Sigma above which the motion does not determine an unknown to any use."""
+
+WEAK_AGAINST_PRIOR = 2.0  # Sigma of the motion to that of the prior, above which the prior remains
+
+OUTLIER_SQUARE = 40.0  # Squared Mahalanobis distance of three components
+LOST_SQUARE = 60.0  # Of a step of drift
+CORRELATION_S = 15.0
+"""Time over which errors may be correlated beyond the drift that is modelled."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExtrinsicPrior:
+    """Where the sensor is by CAD or by an earlier calibration."""
+
+    T_point_sensor: FloatArray  # (4, 4)
+    sigma: (
+        FloatArray  # (6,) in m along, and in rad about, the axes of the reference's point; 0: known exactly
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """What is fitted, and how the frame is aligned."""
+
+    parts: frozenset[FittedPart] = frozenset({"offset", "frame"})
+    align: Alignment = "start"
+    extrinsic_prior: ExtrinsicPrior | None = None
+    max_offset_s: float = 60.0
+    fixed: frozenset[str] = field(default_factory=frozenset)
+    """Of ``Fit.names``: extrinsic components that remain as they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Joint:
+    """Clock, scale and extrinsic, fitted while the frame drifts."""
+
+    trajectory: ReferenceTrajectory
+    rows: Rows
+    unknowns: Unknowns
+    noise: Noise
+    active: list[int]
+    covariance: FloatArray  # (P, P)
+    unobservable: tuple[str, ...]
+
+
+def fit(
+    reference: ReferencePoses, estimate: Estimate, settings: FitSettings, start: Relation | None = None
+) -> Fit:
+    """Fit the parts asked for; of the others, and of what the motion does not determine, ``start`` holds.
+
+    Clock and extrinsic are always fitted together, so that an extrinsic which is not asked for, hence not applied, does not
+    bias the offset. Raises ValueError: less than a second of the estimate overlaps the reference.
+    """
+    start = initial_relation() if start is None else start
+    trajectory = ReferenceTrajectory(reference)
+    return _applied(_fit_jointly(trajectory, estimate, settings, start), estimate, settings, start)
+
+
+def nested_fits(
+    reference: ReferencePoses, estimate: Estimate, settings: FitSettings, start: Relation | None = None
+) -> list[tuple[FitSettings, Fit]]:
+    """Fit growing sets of the parts asked for, to show what each of them hides.
+
+    Nothing; the clock; the frame at the start; the extrinsic; the frame over all (by yaw if the settings say so); the scale.
+    """
+    start = initial_relation() if start is None else start
+    trajectory = ReferenceTrajectory(reference)
+    overall: Alignment = "yaw" if settings.align == "yaw" else "rigid"
+    steps: list[tuple[set[FittedPart], Alignment]] = [
+        (set(), "none"),
+        ({"offset"}, "none"),
+        ({"skew"}, "none"),
+        ({"frame"}, "start"),
+        ({"extrinsic"}, "start"),
+        ({"frame"}, overall),
+        ({"scale"}, overall),
+    ]
+    parts: set[FittedPart] = set()
+    found: list[tuple[FitSettings, Fit]] = []
+    joints: dict[frozenset[FittedPart], _Joint] = {}
+    for added, align in steps:
+        if not added <= settings.parts:
+            continue
+        parts |= added
+        own = replace(settings, parts=frozenset(parts), align=align if "frame" in parts else "none")
+        key = own.parts & {"offset", "skew", "scale"}
+        if key not in joints:
+            joints[key] = _fit_jointly(trajectory, estimate, own, start)
+        found.append((own, _applied(joints[key], estimate, own, start)))
+    return found
+
+
+def _fit_jointly(
+    trajectory: ReferenceTrajectory, estimate: Estimate, settings: FitSettings, start: Relation
+) -> _Joint:
+    prior = settings.extrinsic_prior
+    T_prior = start.T_point_sensor if prior is None else prior.T_point_sensor
+    begun = _initial(trajectory, estimate, settings, start, T_prior)
+    relation = replace(start, offset_s=begun.offset_s)
+    usable = trajectory.covers(on_reference_clock(estimate, relation))
+    n_usable = int(np.count_nonzero(usable))
+    span_s = 0.0 if n_usable < 2 else float(np.ptp(estimate.stamp_ns[usable])) / 1e9
+    rows = rows_of(estimate, usable, max(MIN_STEP_S, span_s / MAX_ROWS))
+    frame = _frame_of_positions(trajectory, rows, begun) if rows.rotation is None else np.eye(3)
+    unknowns = start_states(trajectory, rows, begun, frame)
+    active = [i for i, name in enumerate(NAMES) if _is_free(name, settings, rows)]
+    prior_terms = _prior_terms(settings, active)
+    noise = estimate_noise(trajectory, rows, unknowns)
+    solved: Solved | None = None
+    for _ in range(NOISE_PASSES):
+        unknowns, solved = _iterate(trajectory, rows, unknowns, noise, active, T_prior, prior_terms)
+        noise = estimate_noise(trajectory, rows, unknowns)
+    unobservable = [i for i, name in enumerate(NAMES) if _never_observable(name, settings, rows)]
+    weak = _weak(solved, active, prior_terms) if solved is not None else []
+    if weak:
+        unobservable += weak
+        active = [i for i in active if i not in weak]
+        unknowns = _at_prior(unknowns, weak, begun, T_prior)
+    unknowns, solved = _iterate(trajectory, rows, unknowns, noise, active, T_prior, prior_terms)
+    covariance = _covariance(solved, rows)
+    return _Joint(
+        trajectory, rows, unknowns, noise, active, covariance, tuple(NAMES[i] for i in sorted(unobservable))
+    )
+
+
+def _initial(
+    trajectory: ReferenceTrajectory,
+    estimate: Estimate,
+    settings: FitSettings,
+    start: Relation,
+    T_prior: FloatArray,
+) -> Unknowns:
+    motion = estimate_motion(estimate)
+    offset_s, scale, R = start.offset_s, start.scale, T_prior[:3, :3]
+    if "offset" in settings.parts:
+        offset_s = offset_by_correlation(trajectory, motion, offset_s, settings.max_offset_s)
+    found = extrinsic_rotation(trajectory, motion, offset_s, any_scale="scale" in settings.parts)
+    if found is not None:
+        scale = found[1] if "scale" in settings.parts else scale
+        if settings.extrinsic_prior is None:
+            R = found[0]
+    none = np.zeros((0, 3))
+    return Unknowns(offset_s, start.skew, scale, T_prior[:3, 3], R, np.zeros((0, 3, 3)), none)
+
+
+def _frame_of_positions(trajectory: ReferenceTrajectory, rows: Rows, begun: Unknowns) -> FloatArray:
+    correction_ns = np.rint(1e9 * (begun.offset_s + begun.skew * rows.since_first_s)).astype(np.int64)
+    motion = trajectory.motion_at(rows.stamp_ns + correction_ns)
+    own, target = rows.position_m[motion.known], motion.position_m[motion.known]
+    own, target = own - np.median(own, axis=0), target - np.median(target, axis=0)
+    spread = np.linalg.svd(own.T @ target, compute_uv=False)
+    if spread[1] <= 1e-6 * spread[0]:
+        own, target = own * (1.0, 1.0, 0.0), target * (1.0, 1.0, 0.0)
+        (x, y, _), (u, v, _) = own.T, target.T
+        return exp_so3(np.array([0.0, 0.0, math.atan2(float(x @ v - y @ u), float(x @ u + y @ v))]))
+    return rotation_between(own, target)
+
+
+def _is_free(name: str, settings: FitSettings, rows: Rows) -> bool:
+    if name in settings.fixed or _never_observable(name, settings, rows):
+        return False
+    if name.startswith("extrinsic"):
+        prior = settings.extrinsic_prior
+        return prior is None or prior.sigma[NAMES.index(name) - 3] > 0
+    return name.removesuffix("_s") in settings.parts
+
+
+def _never_observable(name: str, settings: FitSettings, rows: Rows) -> bool:
+    return (
+        rows.rotation is None
+        and name.startswith("extrinsic")
+        and name.endswith("_rad")
+        and name not in settings.fixed
+    )
+
+
+def _prior_terms(settings: FitSettings, active: list[int]) -> FloatArray:
+    """Inverse variances of the prior, (9,)."""
+    weight = np.zeros(len(NAMES))
+    if settings.extrinsic_prior is not None:
+        sigma = settings.extrinsic_prior.sigma
+        weight[3:] = np.where(sigma > 0, 1.0 / np.maximum(sigma, 1e-12) ** 2, 0.0)
+    weight[[i for i in range(len(NAMES)) if i not in active]] = 0.0
+    return weight
+
+
+def _iterate(
+    trajectory: ReferenceTrajectory,
+    rows: Rows,
+    unknowns: Unknowns,
+    noise: Noise,
+    active: list[int],
+    T_prior: FloatArray,
+    prior_weight: FloatArray,
+) -> tuple[Unknowns, Solved]:
+    """Iterate to convergence; returns the unknowns with the system at which they converged."""
+    dimensions = 3 if rows.rotation is None else 6
+    covariance = _in_band(
+        own_covariance(trajectory, _stamp_ns(rows, unknowns), _known(trajectory, rows, unknowns)), rows
+    )
+    turn = None
+    for _ in range(MAX_ITERATIONS):
+        linear = linearise(trajectory, rows, unknowns, turn)
+        whitening = whiten(
+            linear.pose, noise.white, covariance, linear.arm_m, has_orientation=rows.rotation is not None
+        )
+        turn = whitening.turn
+        weight = np.where(linear.known, robust_weight(whitening.square, dimensions), 0.0)
+        walk_variance = _walk_variance(rows, unknowns, noise)
+        walk_weight = robust_weight(_pairwise(linear.walk**2 / walk_variance), 3)
+        difference = np.zeros(len(NAMES))
+        difference[3:6] = unknowns.arm_m - T_prior[:3, 3]
+        difference[6:] = log_so3(unknowns.R_point_sensor @ T_prior[:3, :3].T)
+        solved = solve(
+            rows,
+            linear,
+            whitening.matrix * np.sqrt(weight)[:, None, None],
+            np.repeat(walk_weight, 3, axis=1) / walk_variance,
+            active,
+            (difference, prior_weight),
+        )
+        unknowns = unknowns.moved(solved.border_step, solved.state_step)
+        sigma = 1.0 / np.sqrt(np.maximum(np.diag(solved.information), 1e-30))
+        if (np.abs(solved.border_step[active]) <= CONVERGED_SIGMAS * sigma).all():
+            break
+    return unknowns, solved
+
+
+def _in_band(covariance: FloatArray | None, rows: Rows) -> FloatArray | None:
+    """Inflate a covariance of errors that are correlated from row to row to that of white ones with as much power in slow motion."""
+    if covariance is None:
+        return None
+    return covariance * max(
+        1.0, 2.0 * REFERENCE_CORRELATION_S / float(np.median(np.diff(rows.since_first_s)))
+    )
+
+
+def _pairwise(squares: FloatArray) -> FloatArray:
+    """Sum over position and over rotation, (N, 2)."""
+    return np.asarray(squares.reshape(-1, 2, 3).sum(axis=2))
+
+
+def _stamp_ns(rows: Rows, unknowns: Unknowns) -> NDArray[np.int64]:
+    correction_ns = 1e9 * (unknowns.offset_s + unknowns.skew * rows.since_first_s)
+    return np.asarray(rows.stamp_ns + np.rint(correction_ns).astype(np.int64))
+
+
+def _known(trajectory: ReferenceTrajectory, rows: Rows, unknowns: Unknowns) -> NDArray[np.bool_]:
+    return trajectory.covers(_stamp_ns(rows, unknowns))
+
+
+def _driven_m(rows: Rows, unknowns: Unknowns) -> FloatArray:
+    steps = np.diff(unknowns.scale * rows.position_m[rows.knot], axis=0)
+    return np.asarray(np.sqrt((steps**2).sum(axis=1)))
+
+
+def _walk_variance(rows: Rows, unknowns: Unknowns, noise: Noise) -> FloatArray:
+    driven_m = _driven_m(rows, unknowns)[:, None]
+    return np.asarray(noise.walk_per_s * rows.step_s[:, None] + noise.walk_per_m * driven_m)
+
+
+def _weak(solved: Solved, active: list[int], prior_weight: FloatArray) -> list[int]:
+    """Return the unknowns that the motion does not determine, the weakest first: each that goes makes others determinable."""
+    limit = np.array([OBSERVABLE_SIGMA[NAMES[i]] for i in active])
+    weight = prior_weight[active]
+    with_prior = weight > 0
+    limit[with_prior] = np.minimum(limit[with_prior], WEAK_AGAINST_PRIOR / np.sqrt(weight[with_prior]))
+    information = (solved.information - np.diag(weight)) * limit[:, None] * limit
+    remaining, weak = list(range(len(active))), []
+    while remaining:
+        values, vectors = np.linalg.eigh(information[np.ix_(remaining, remaining)])
+        variance = (vectors**2 / np.maximum(values, 1e-9)).sum(axis=1)
+        worst = int(np.argmax(variance))
+        if variance[worst] <= 1.0:
+            break
+        weak.append(active[remaining.pop(worst)])
+    return weak
+
+
+def _at_prior(unknowns: Unknowns, weak: list[int], begun: Unknowns, T_prior: FloatArray) -> Unknowns:
+    names = {NAMES[i] for i in weak}
+    arm_m = unknowns.arm_m.copy()
+    turned = log_so3(unknowns.R_point_sensor @ begun.R_point_sensor.T)
+    for i in weak:
+        if 3 <= i < 6:
+            arm_m[i - 3] = T_prior[i - 3, 3]
+        elif i >= 6:
+            turned[i - 6] = 0.0
+    return replace(
+        unknowns,
+        offset_s=begun.offset_s if "offset_s" in names else unknowns.offset_s,
+        skew=begun.skew if "skew" in names else unknowns.skew,
+        scale=begun.scale if "scale" in names else unknowns.scale,
+        arm_m=arm_m,
+        R_point_sensor=exp_so3(turned) @ begun.R_point_sensor,
+    )
+
+
+def _covariance(solved: Solved, rows: Rows) -> FloatArray:
+    """Covariance of the active unknowns, (P, P): that of the model, widened where the residuals' pull is correlated beyond it.
+
+    Sandwich of the information around the covariance of the scores, whose correlation over time counts with Bartlett's
+    weights (W. K. Newey and K. D. West, 1987).
+    """
+    p = len(solved.information)
+    if not p:
+        return np.zeros((0, 0))
+    model = np.linalg.pinv(solved.information)
+    scores = solved.scores
+    lags = max(1, round(CORRELATION_S / float(np.median(rows.step_s))))
+    n = len(scores)
+    padded = np.concatenate([np.zeros((lags, p)), scores, np.zeros((lags, p))])
+    running = np.cumsum(np.concatenate([np.zeros((1, p)), padded]), axis=0)
+    sums = running[lags:] - running[:-lags]
+    # Sums over every window of this length: Bartlett's weights. Fewer independent windows than unknowns say too little.
+    meat = sums.T @ sums / lags
+    windows = max(n / lags, p + 1.0)
+    sandwich = model @ meat @ model * windows / (windows - p if windows - p > 1 else 1.0)
+    wider = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(model), 1e-300), 1.0))
+    return np.asarray(model * wider[:, None] * wider)
+
+
+def _applied(joint: _Joint, estimate: Estimate, settings: FitSettings, start: Relation) -> Fit:
+    """Return the relation with the parts asked for, and the frame by its alignment."""
+    unknowns = joint.unknowns
+    prior = settings.extrinsic_prior
+    T_point_sensor = start.T_point_sensor if prior is None else prior.T_point_sensor
+    if "extrinsic" in settings.parts:
+        T_point_sensor = transform_from(unknowns.R_point_sensor, unknowns.arm_m)
+    relation = Relation(
+        offset_s=float(unknowns.offset_s),
+        skew=float(unknowns.skew),
+        T_point_sensor=T_point_sensor,
+        T_station1_frame=start.T_station1_frame,
+        scale=float(unknowns.scale),
+    )
+    stated = [i for i in joint.active if i < 3 or "extrinsic" in settings.parts]
+    chosen = [joint.active.index(i) for i in stated]
+    covariance = joint.covariance[np.ix_(chosen, chosen)]
+    names = tuple(NAMES[i] for i in stated)
+    unobservable = tuple(
+        n for n in joint.unobservable if not n.startswith("extrinsic") or "extrinsic" in settings.parts
+    )
+    rows, used, good = _used(joint, estimate)
+    if "frame" in settings.parts and settings.align != "none":
+        relation, by_unknowns, own, determined = _with_frame(joint, rows, good, settings.align, relation)
+        cross = by_unknowns[:, stated] @ covariance
+        own = own + cross @ by_unknowns[:, stated].T
+        covariance = np.block([[covariance, cross.T], [cross, own]])
+        kept = np.concatenate([np.ones(len(stated), dtype=np.bool_), determined])
+        covariance = covariance[np.ix_(kept, kept)]
+        names += tuple(name for name, ok in zip(FRAME_NAMES, determined, strict=True) if ok)
+    return Fit(relation, names, covariance, unobservable, used)
+
+
+def _used(joint: _Joint, estimate: Estimate) -> tuple[Rows, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return all poses that are paired, of the estimate a mask of the used ones, (M,), and of the rows, (N,)."""
+    relation = Relation(joint.unknowns.offset_s, joint.unknowns.skew, np.eye(4), np.eye(4), 1.0)
+    rows = all_rows(estimate, joint.rows, joint.trajectory.covers(on_reference_clock(estimate, relation)))
+    linear = linearise(joint.trajectory, rows, joint.unknowns)
+    covariance = own_covariance(joint.trajectory, _stamp_ns(rows, joint.unknowns), linear.known)
+    has_orientation = rows.rotation is not None
+    whitening = whiten(
+        linear.pose, joint.noise.white, covariance, linear.arm_m, has_orientation=has_orientation
+    )
+    step_square = _pairwise(linear.walk**2 / _walk_variance(rows, joint.unknowns, joint.noise))
+    lost = np.max(step_square, axis=1) > LOST_SQUARE
+    good = linear.known & (whitening.square <= OUTLIER_SQUARE) & ~lost[rows.interval]
+    if np.count_nonzero(good) < 3:
+        good = linear.known.copy()
+    used = np.zeros(len(estimate.stamp_ns), dtype=np.bool_)
+    used[rows.row[good]] = True
+    return rows, used, good
+
+
+def _with_frame(
+    joint: _Joint, rows: Rows, good: NDArray[np.bool_], align: Alignment, relation: Relation
+) -> tuple[Relation, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return the relation with its frame, the frame's derivative by the unknowns, (6, 9), its own covariance, what it fits."""
+    correction_ns = 1e9 * (relation.offset_s + relation.skew * rows.since_first_s)
+    motion = joint.trajectory.motion_at(rows.stamp_ns + np.rint(correction_ns).astype(np.int64))
+    sensor = motion.transform @ relation.T_point_sensor
+    good = good & motion.known
+    own_m = relation.scale * rows.position_m
+    frame = align_frame(align, rows, own_m, sensor, np.ones(len(own_m)), good)
+    covariance = own_covariance(
+        joint.trajectory, rows.stamp_ns + np.rint(correction_ns).astype(np.int64), motion.known
+    )
+    if covariance is not None:
+        arms = rotate(motion.rotation, relation.T_point_sensor[:3, 3])
+        variance = np.einsum("nii->n", at_sensor(covariance, arms)[:, :3, :3])
+        excess = np.maximum(variance - np.median(variance[good]), 0.0)
+        # Errors of an alignment are mostly drift: the reference counts less only where it adds to this.
+        aligned = rotate(frame.T_station1_frame[:3, :3], own_m) + frame.T_station1_frame[:3, 3]
+        usual = float(np.median(((aligned - sensor[:, :3, 3]) ** 2).sum(axis=1)[frame.kept]))
+        weight = usual / (usual + excess) if usual > 0 else np.ones(len(own_m))
+        frame = align_frame(align, rows, own_m, sensor, weight, good)
+    R = frame.T_station1_frame[:3, :3]
+    aligned = rotate(R, own_m) + frame.T_station1_frame[:3, 3]
+    arm_m = rotate(motion.rotation, relation.T_point_sensor[:3, 3])
+    by_unknowns = np.zeros((len(own_m), 6, len(NAMES)))
+    velocity = motion.velocity_mps + np.cross(motion.angular_velocity_radps, arm_m)
+    by_unknowns[:, :3, 0], by_unknowns[:, 3:, 0] = -velocity, -motion.angular_velocity_radps
+    by_unknowns[:, :, 1] = by_unknowns[:, :, 0] * rows.since_first_s[:, None]
+    by_unknowns[:, :3, 2] = rotate(R, rows.position_m)
+    by_unknowns[:, :3, 3:6] = by_unknowns[:, 3:, 6:9] = -motion.rotation
+    change = -np.einsum("nij,njl->il", frame.by_position, by_unknowns[:, :3])
+    change -= np.einsum("nij,njl->il", frame.by_rotation, by_unknowns[:, 3:])
+    own = drift_covariance(frame, rows, aligned, joint.noise, _driven_m(rows, joint.unknowns))
+    return replace(relation, T_station1_frame=frame.T_station1_frame), change, own, frame.determined

@@ -4,6 +4,12 @@ Comes in: reference poses with covariance, estimates of other programs (poses or
 of their own point on the robot). Goes out: time offset, extrinsic and frame with uncertainties, and error statistics.
 """
 
+from tsgt.analysis.compare.checks import (
+    InputFinding,
+    input_findings,
+    quaternion_finding,
+    relative_offset_s,
+)
 from tsgt.analysis.compare.fitting import ExtrinsicPrior, FitSettings, fit, nested_fits
 from tsgt.analysis.compare.initialisation import overlap_s
 from tsgt.analysis.compare.pairing import PairedPoses, pair
@@ -17,12 +23,16 @@ __all__ = [
     "Fit",
     "FitSettings",
     "FittedPart",
+    "InputFinding",
     "PairedPoses",
     "ReferencePoses",
     "Relation",
     "fit",
     "initial_relation",
+    "input_findings",
     "nested_fits",
     "overlap_s",
     "pair",
+    "quaternion_finding",
+    "relative_offset_s",
 ]

@@ -1,6 +1,6 @@
 """Expected accuracy of a pose with an IMU, from one station or more: covariance analysis along a drive. Sans-I/O.
 
-The error of position, velocity, rotation, biases and tilt of gravity is propagated along a path by the noise of the IMU, and
+The error of position, velocity, rotation, biases, tilt of gravity and the accelerometer's axes is propagated along a path by the noise of the IMU, and
 corrected by measurements of the stations in turn: Kalman filter and Rauch-Tung-Striebel smoother on covariances alone (P.
 S. Maybeck, *Stochastic Models, Estimation, and Control*, 1979, chapter 6), as the model is linear in small errors. Not included: errors
 of the set-up (frames, prisms, mounting of the IMU).
@@ -36,15 +36,16 @@ MIN_LOOP_M = 10.0
 START_S, END_S = 20.0, 5.0  # at the ends of the drive, not evaluated
 EVALUATED_EVERY = 5  # steps
 
-_P, _V, _R, _BG, _BA, _TILT = (
+_P, _V, _R, _BG, _BA, _TILT, _MATRIX = (
     slice(0, 3),
     slice(3, 6),
     slice(6, 9),
     slice(9, 12),
     slice(12, 15),
     slice(15, 17),
+    slice(17, 23),  # what forces along x and y of the robot add along each of its axes
 )
-_DIM = 17
+_DIM = 23
 _START_SIGMAS = np.repeat([1.0, 1.0, 0.5], 3)  # of position in m, velocity in m/s, rotation in rad
 
 
@@ -134,14 +135,15 @@ def inertial_accuracy(
 
 
 def _transition(path: DrivenPath, row: int, gravity_mps2: float) -> FloatArray:
-    """Return the transition (17, 17) of the error over a step."""
+    """Return the transition (23, 23) of the error over a step."""
     dt, rotation = STEP_S, path.rotation[row]
     force = rotation.T @ (path.acceleration_mps2[row] + [0.0, 0.0, gravity_mps2])
     turned = -rotation @ skew(force)
     tilted = -gravity_mps2 * np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
+    scaled = -np.kron(rotation, force[:2])
     phi = np.eye(_DIM)
     phi[_P, _V] = dt * np.eye(3)
-    for columns, effect in ((_R, turned), (_BA, -rotation), (_TILT, tilted)):
+    for columns, effect in ((_R, turned), (_BA, -rotation), (_TILT, tilted), (_MATRIX, scaled)):
         phi[_V, columns] = dt * effect
         phi[_P, columns] = dt**2 / 2 * effect
     phi[_R, _R] = exp_so3(np.array([0.0, 0.0, -path.yaw_rate_radps[row] * dt]))
@@ -150,7 +152,7 @@ def _transition(path: DrivenPath, row: int, gravity_mps2: float) -> FloatArray:
 
 
 def _process_noise(noise: ImuNoise) -> FloatArray:
-    """Return the covariance (17, 17) that a step adds."""
+    """Return the covariance (23, 23) that a step adds."""
     dt, eye = STEP_S, np.eye(3)
     q = np.zeros((_DIM, _DIM))
     velocity = noise.accelerometer_noise_density**2
@@ -170,7 +172,7 @@ def _filter(
     steps: Sequence[FloatArray],
     noise: FloatArray,
 ) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return the covariances (17, 17) after the measurements at each instant, and before those at each later one.
+    """Return the covariances (23, 23) after the measurements at each instant, and before those at each later one.
 
     ``layout``: relative to the IMU.
     """
@@ -180,6 +182,7 @@ def _filter(
             _START_SIGMAS,
             np.repeat([initial.gyro_bias_radps, initial.accelerometer_bias_mps2], 3),
             np.repeat(max(imu.tilt_sigma_rad, 1e-6), 2),
+            np.repeat(imu.noise.accelerometer_scale_misalignment, 6),
         ]
     )
     covariance = np.diag(sigmas**2)

@@ -49,15 +49,15 @@ def test_transition_is_that_of_the_integrated_motion() -> None:
     def moved(error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         turned = rotation @ Rotation.from_rotvec(error[6:9]).as_matrix()
         down = Rotation.from_rotvec([*error[15:17], 0.0]).as_matrix() @ [0.0, 0.0, -g]
-        acceleration = turned @ (force - error[12:15]) + down
+        acceleration = turned @ (force - error[12:15] - error[17:].reshape(3, 2) @ force[:2]) + down
         velocity = error[3:6] + dt * acceleration
         position = error[:3] + dt * error[3:6] + dt**2 / 2 * acceleration
         return position, velocity, turned @ Rotation.from_rotvec(dt * (rate - error[9:12])).as_matrix()
 
     phi = inertial_study._transition(path, row, g)
-    position, velocity, after = moved(np.zeros(17))
-    for column in range(17):
-        error = np.zeros(17)
+    position, velocity, after = moved(np.zeros(23))
+    for column in range(23):
+        error = np.zeros(23)
         error[column] = 1e-6
         p, v, r = moved(error)
         angle = Rotation.from_matrix(after.T @ r).as_rotvec()
@@ -74,13 +74,14 @@ def test_covariances_are_those_of_a_dense_problem(monkeypatch: pytest.MonkeyPatc
     path = short(DrivenPath.through(PLACES, closed=True), 30)
     point = np.array([0.3, 0.2, 1.0])
     found = inertial_accuracy(LAYOUT, STATIONS, path, IMU, point).smoothed
-    n, dim, origin = 30, 17, np.array(IMU.position_m)
+    n, dim, origin = 30, 23, np.array(IMU.position_m)
     noise = estimation_noise(IMU.noise)
     q = inertial_study._process_noise(noise)
-    q[15:, 15:] = 1e-14 * np.eye(2)
+    q[15:, 15:] = 1e-14 * np.eye(8)
     sigmas = np.repeat(
-        [1.0, 1.0, 0.5, noise.gyro_bias_radps, noise.accelerometer_bias_mps2, IMU.tilt_sigma_rad], 3
+        [1.0, 1.0, 0.5, noise.gyro_bias_radps, noise.accelerometer_bias_mps2, IMU.tilt_sigma_rad, 0.0, 0.0], 3
     )[:dim]
+    sigmas[17:] = IMU.noise.accelerometer_scale_misalignment
     information = np.zeros((n * dim, n * dim))
     information[:dim, :dim] = np.diag(1 / sigmas**2)
     for row in range(n - 1):

@@ -37,7 +37,7 @@ FULL_DISK_BYTES = 50_000_000
 ALARMS = frozenset(
     {
         "station_lost", "radio_failed", "geofence_exited", "layout_residual_high", "imu_setup_wrong", "imu_lost",
-        "beacon_time_rejected", "link_delay_anomaly", "unauthenticated", "station_contradicted",
+        "beacon_time_rejected", "link_delay_anomaly", "unauthenticated", "station_contradicted", "disk_full", "disk_failed",
     }
 )  # fmt: skip
 """Events that need the operator; those of ``_END`` end them."""
@@ -52,11 +52,16 @@ _END = {
 _GOOD_NEWS = frozenset(
     {
         "station_recovered", "station_measuring", "station_tracking", "radio_recovered", "imu_setup_confirmed",
-        "imu_recovered", "imu_plausible", "imu_used", "odometry_recovered", "odometry_agrees", "geofence_entered", "layout_residual_normal",
+        "disk_recovered", "imu_recovered", "imu_plausible", "imu_used", "odometry_recovered", "odometry_agrees", "geofence_entered", "layout_residual_normal",
     }
 )  # fmt: skip
 
-_FENCE = re.compile(r"geofence (.*?) (exited|entered)")
+_FENCE = re.compile(r"geofence (.*?) (?:exited|entered)(: no valid pose)?")
+
+UNCONFIRMED = "the set-up of the IMU is not confirmed yet: drive curves, accelerate and brake"
+"""The operator has to act: without that poses do without the IMU, or rest on one that may be set up wrongly."""
+
+NONE_RECEIVED = "no station is received: the master's radio?"
 
 
 def kind(event: str) -> str:
@@ -75,7 +80,8 @@ class StandingEvents:
         """Take an event."""
         if (fence := _FENCE.match(event.message)) and event.event.startswith("geofence_"):
             if event.event == "geofence_exited":
-                self._fences[fence[1]] = event.message
+                where = "perhaps outside" if fence[2] else "outside"
+                self._fences[fence[1]] = f"{where} the geofence {fence[1]}{fence[2] or ''}"
             else:
                 self._fences.pop(fence[1], None)
         elif event.event in _END.values():
@@ -85,7 +91,12 @@ class StandingEvents:
 
     def fences(self) -> list[Finding]:
         """Return the geofences that the robot has left, or may have left."""
-        return [Finding(Level.CARE, f"outside the geofence {name}", urgent=True) for name in self._fences]
+        return [Finding(Level.CARE, text, urgent=True) for text in self._fences.values()]
+
+    @property
+    def radio_failure(self) -> str:
+        """Why the master's radio cannot be used; empty while it can."""
+        return self._messages.get("radio_failed", "")
 
     def findings(self) -> list[Finding]:
         """Return the other lasting states."""
@@ -95,10 +106,17 @@ class StandingEvents:
         ]
 
 
-def explanation(pose: PoseRecord, limits: ValidityLimits | None, conditions: Mapping[int, Condition]) -> str:
+def explanation(
+    pose: PoseRecord,
+    limits: ValidityLimits | None,
+    conditions: Mapping[int, Condition],
+    radio_failure: str = "",
+) -> str:
     """Return why a pose is invalid, for people."""
     match pose.reason:
         case "outage" | "station_status":
+            if radio_failure or _none_received(conditions):
+                return radio_failure or NONE_RECEIVED
             return _missing(pose, conditions) or "a prism is not measured"
         case "uncertain":
             return _uncertain(pose, limits)
@@ -134,7 +152,7 @@ def degradations(
         "prism_missing": _missing(pose, conditions) or "a prism is not measured",
         "old_measurements": "the pose rests on old measurements",
         "ambiguous": "measurements contradict each other",
-        "imu_unconfirmed": "the set-up of the IMU is not confirmed yet: drive, with turns",
+        "imu_unconfirmed": UNCONFIRMED,
         "residual": "the prisms nearly miss their layout: tripod or prism moved?",
         "uncertain": _uncertain(smoothed or pose, limits),
     }
@@ -192,6 +210,10 @@ def waiting_for(conditions: Mapping[int, Condition]) -> str:
     return "the estimator is starting" if conditions else "no status yet"
 
 
+def _none_received(conditions: Mapping[int, Condition]) -> bool:
+    return len(conditions) > 1 and all(found.state == "silent" for found in conditions.values())
+
+
 def _stations_in_words(conditions: Mapping[int, Condition]) -> list[str]:
     """Return what the stations do that need the operator, those that do the same together."""
     by_words: dict[str, list[str]] = {}
@@ -223,13 +245,14 @@ def fence_findings(setup: SetupRecord | None, position: tuple[float, float] | No
     return found
 
 
-def station_findings(status: StatusRecord | None, conditions: Mapping[int, Condition]) -> list[Finding]:
-    """Return which stations need the operator."""
-    if status is None:
+def station_findings(
+    status: StatusRecord | None, conditions: Mapping[int, Condition], radio_failure: str = ""
+) -> list[Finding]:
+    """Return which stations need the operator; none where the radio fails, which another finding tells."""
+    if status is None or radio_failure:
         return []
-    silent = [number for number, found in conditions.items() if found.state == "silent"]
-    if len(silent) == len(conditions) > 1:
-        return [Finding(Level.CARE, "no station is received: the master's radio?", urgent=True)]
+    if _none_received(conditions):
+        return [Finding(Level.CARE, NONE_RECEIVED, urgent=True)]
     return [Finding(Level.CARE, text) for text in _stations_in_words(conditions)]
 
 
@@ -244,6 +267,8 @@ def imu_findings(status: StatusRecord | None) -> list[Finding]:
         return [Finding(Level.CARE, f"IMU: {imu.problem}")]
     if imu.use == "wrong_setup":
         return [Finding(Level.CARE, "the set-up of the IMU is wrong")]
+    if imu.use == "unconfirmed":
+        return [Finding(Level.CARE, UNCONFIRMED)]
     if imu.use == "disagrees" or imu.disagreement:
         return [Finding(Level.CARE, "the IMU disagrees with the prisms")]
     return []

@@ -291,6 +291,7 @@ class MissionState:
             delay_s=self._delay.delay_s,
         )
         conditions = self._conditions(now_s)
+        radio_failure = self._standing.radio_failure
         pose, limits = self._live, self._setup.limits if self._setup is not None else None
         facts = None
         if pose is not None:
@@ -298,7 +299,7 @@ class MissionState:
             facts = PoseFacts(
                 age_s=now_s - self._live_s,
                 valid=record.valid and bool(self._live_valid),
-                explanation=findings.explanation(record, limits, conditions),
+                explanation=findings.explanation(record, limits, conditions, radio_failure),
                 degradations=findings.degradations(record, self._recent_smoothed(now_s), limits, conditions),
             )
         others = [
@@ -306,11 +307,12 @@ class MissionState:
             *findings.fence_findings(self._setup, self._position()),
             *findings.storage_findings(self._status),
             *self._standing.findings(),
-            *findings.station_findings(self._status, conditions),
+            *findings.station_findings(self._status, conditions, radio_failure),
             *findings.imu_findings(self._status),
             *findings.odometry_findings(self._status),
         ]
-        return judge(stream, facts, findings.waiting_for(conditions), _without_repetition(others))
+        waiting_for = radio_failure or findings.waiting_for(conditions)
+        return judge(stream, facts, waiting_for, _without_repetition(others))
 
     def _conditions(self, now_s: float) -> dict[int, stations.Condition]:
         if self._status is None:

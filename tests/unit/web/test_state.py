@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from harness.records import ODOMETRY_STATUS, SETUP, START, measurement
+from harness.records import IMU_STATUS, ODOMETRY_STATUS, SETUP, START, measurement
 from harness.web import feed, mission, pose, station, status
 
 from tsgt.model import ReferencePoint, Status
@@ -99,6 +99,35 @@ def test_all_stations_silent_is_the_radio() -> None:
     silent = [station(number, last_heard_s=6.0, answering=False) for number in (1, 2, 3)]
     feed(state, status(10.0, *silent), pose(10.0), now_s=10.0)
     assert verdict(state, 10.1) == ("CARE", "no station is received: the master's radio?")
+    feed(state, pose(11.0, valid=False, reason="outage", quality="invalid"), now_s=11.0)
+    assert verdict(state, 11.1) == ("NO POSE", "no station is received: the master's radio?")
+    assert state.view(11.1)["alarms"] == []
+
+
+def test_failed_radio_is_the_cause_of_silent_stations() -> None:
+    """As the master tells it, once."""
+    state = mission()
+    failure = "the radio of the master failed, no station can be reached: SPI timeout"
+    silent = [station(number, last_heard_s=6.0, answering=False) for number in (1, 2, 3)]
+    lost = pose(10.0, valid=False, reason="outage", quality="invalid")
+    feed(state, event("radio_failed", failure), status(10.0, *silent), lost, now_s=10.0)
+    assert verdict(state, 10.1) == ("NO POSE", failure)
+    assert state.view(10.1)["alarms"] == []
+    feed(state, status(12.0, *silent), now_s=12.0)
+    assert verdict(state, 12.0) == ("NO POSE", f"no pose for 2 s: {failure}")
+
+
+def test_unconfirmed_imu_is_a_finding() -> None:
+    """The operator has to drive; it is no disagreement, although the status says what is open."""
+    state = mission()
+    imu = replace(
+        IMU_STATUS, use="unconfirmed", disagreement="not confirmed by driving yet: mounting, latency"
+    )
+    feed(state, status(10.0, imu=imu), pose(10.0), now_s=10.0)
+    assert verdict(state, 10.1) == (
+        "CARE",
+        "the set-up of the IMU is not confirmed yet: drive curves, accelerate and brake",
+    )
 
 
 def test_missing_prism_is_explained_with_what_its_station_does() -> None:
@@ -127,7 +156,7 @@ def test_event_of_the_fence_lasts_until_the_robot_is_back() -> None:
     """The master's fence counts uncertainty and lost poses, which a position alone does not tell."""
     state = running()
     feed(state, event("geofence_exited", "geofence site exited: no valid pose for 2 s"), now_s=10.1)
-    assert verdict(state, 10.2) == ("CARE", "outside the geofence site")
+    assert verdict(state, 10.2) == ("CARE", "perhaps outside the geofence site: no valid pose")
     feed(state, event("geofence_entered", "geofence site entered: the robot is 3 m within"), now_s=10.3)
     feed(state, pose(11.2), now_s=11.2)
     assert verdict(state, 11.3)[0] == "GOOD"

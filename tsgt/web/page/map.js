@@ -59,11 +59,12 @@ export class MissionMap {
     return [Math.cos(heading), -Math.sin(heading)];
   }
 
-  fit() {
+  // Stations, trail and robot, and the fences as well if asked for: beside a large fence all else would be too small.
+  fit(fences = true) {
     const points = this.trail.filter((point) => point);
     if (this.setup) {
       for (const station of this.setup.stations) points.push(station.at);
-      for (const fence of this.setup.fences) points.push(...fence.polygon);
+      if (fences) for (const fence of this.setup.fences) points.push(...fence.polygon);
     }
     if (this.last) points.push(this.last.at);
     if (!points.length) return;
@@ -82,7 +83,7 @@ export class MissionMap {
     this.view = view;
     this.stale = stale;
     if (view && view.pose && view.pose.valid) this.last = view.pose;
-    if (!this.fitted && this.setup && (this.last || this.trail.length)) this.fit();
+    if (!this.fitted && this.setup && (this.last || this.trail.length)) this.fit(false);
     this.draw();
   }
 

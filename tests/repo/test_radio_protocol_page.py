@@ -19,6 +19,7 @@ from tsgt.radio.superframe.wire import (
     Authenticator,
     Beacon,
     CommandResponse,
+    ConditionItem,
     EncodedCommand,
     EncodedDirection,
     EncodedMeasurement,
@@ -248,7 +249,13 @@ BLOCK = MeasurementBlock(
 JOINING = Reply(
     join_request=JoinRequest(nonce=0x33333333, stream_id=0xBEEF, first_sequence=5417, oldest=5417),
     status_report=StatusReport(
-        prism=3, direct=False, connected=True, missed_slots=1, rejected_beacons=0, rssi_dbm=-97
+        prism=3,
+        direct=False,
+        connected=True,
+        missed_slots=1,
+        rejected_beacons=0,
+        rssi_dbm=-97,
+        condition=ConditionItem(0, 86),
     ),
     blocks=(
         MeasurementBlock(
@@ -269,7 +276,13 @@ REPLIES = {
     "a station joins": JOINING,
     "a response": Reply(
         status_report=StatusReport(
-            prism=4, direct=False, connected=True, missed_slots=0, rejected_beacons=0, rssi_dbm=-88
+            prism=4,
+            direct=False,
+            connected=True,
+            missed_slots=0,
+            rejected_beacons=0,
+            rssi_dbm=-88,
+            condition=ConditionItem(2, 133),
         ),
         turnaround_us=178_344,
         response=CommandResponse(5, ok=True),

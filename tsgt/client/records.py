@@ -246,6 +246,8 @@ class StationStatus:
     outside_lag_window: int | None = None
     battery_percent: int | None = None
     atmospheric_ppm: float | None = None
+    activity: str | None = None
+    problem: str | None = None
     last_target_check_age_s: float | None = None
 
 

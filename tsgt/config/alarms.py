@@ -17,6 +17,8 @@ AlarmName = Literal[
     "station_not_tracking",
     "station_tracking",
     "instrument_status",
+    "battery_low",
+    "battery_recovered",
     "layout_residual_high",
     "layout_residual_normal",
     "geofence_exited",
@@ -38,6 +40,7 @@ AlarmName = Literal[
 
 DEFAULT_ALARMS: tuple[AlarmName, ...] = (
     "station_lost",
+    "battery_low",
     "layout_residual_high",
     "geofence_exited",
     "disk_low",

@@ -10,6 +10,7 @@ from tsgt.config import BridgeInstrumentConfig, LeicaInstrumentConfig
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.doctor.serial_line import line_holder
 from tsgt.errors import InstrumentError
+from tsgt.recording import LOW_BATTERY_PERCENT
 
 if TYPE_CHECKING:
     from tsgt.config import InstrumentConfig
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from tsgt.station.leica import Identity
 
 LOW_PERCENT = 50  # Minimum on the evening before a day in the field
-EMPTY_PERCENT = 20
 
 LEVEL_RAD = math.radians(2 / 60)  # Half of the range of a Leica compensator
 _NAMES = ("instrument", "licence", "battery", "level")
@@ -160,7 +160,7 @@ def _check_battery(percent: int | None, *, external: bool) -> Finding:
     text = f"{percent} %"
     if external:
         return ok("battery", f"on external power; internal battery {text}")
-    if percent < EMPTY_PERCENT:
+    if percent < LOW_BATTERY_PERCENT:
         return failed("battery", f"{text}: change the instrument's battery")
     if percent < LOW_PERCENT:
         return note("battery", f"{text}: not enough for a day; charge it, or bring another one")

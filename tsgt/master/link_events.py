@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from tsgt.model import PolarMeasurement
+    from tsgt.radio.superframe import InstrumentCondition
     from tsgt.recording import BeaconRecord, ClockRecord
     from tsgt.timesync.two_way import ClockEstimate
 
@@ -69,6 +70,7 @@ class SuperframeState:
     outstanding: int
     missed_slots: int
     rejected_beacons: int
+    condition: InstrumentCondition
 
 
 class ClockStepped(_OfStation):

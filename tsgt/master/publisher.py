@@ -111,6 +111,7 @@ class Publisher:
                 self.put(record)
             case link_events.SuperframeState():
                 statistics.superframe_state(event)
+                self._put_all(detector.battery(event.station, event.condition.battery_percent, now_ns))
             case link_events.TrackedPrism(station, prism):
                 statistics.tracked_prism(station, prism)
             case link_events.TrackingResult(station, prism, tracks):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tsgt.model import Status
-from tsgt.recording import EventRecord
+from tsgt.recording import LOW_BATTERY_PERCENT, EventRecord
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -18,6 +18,9 @@ LOSS_TIMEOUT_NS = 5_000_000_000
 
 IDLE_TIMEOUT_NS = 10_000_000_000
 """A station that sends no new measurement for this long is idle; no instrument pauses for longer."""
+
+CHARGED_BATTERY_PERCENT = LOW_BATTERY_PERCENT + 10
+"""A low battery is low until it has this again: changed, or charged."""
 
 CLOCK_STEP_THRESHOLD_NS = 100_000_000
 """A change of the offset between the machine's Unix clock and the master's timeline that counts as a step."""
@@ -46,6 +49,7 @@ class _Station:
     nothing_new_since_ns: int | None = None
     """First reply without a new measurement; None while there are new ones."""
     idle: bool = False
+    battery_low: bool = False
     meaning: str = _MEANING[Status.OK]
     newest: tuple[int, int] = (-1, 0)  # sequence number and stamp of the newest measurement
 
@@ -83,6 +87,18 @@ class StationEventDetector:
             return [_event(now_ns, "station_tracking", f"now tracks prism {prism}", station)]
         text = f"does not track prism {prism}; check its instrument. The command is repeated"
         return [_event(now_ns, "station_not_tracking", text, station)]
+
+    def battery(self, station: int, percent: int | None, now_ns: int) -> list[EventRecord]:
+        """Take the charge of an instrument's battery; return the event of one that is low, or no longer so."""
+        found = self._stations[station]
+        threshold = CHARGED_BATTERY_PERCENT if found.battery_low else LOW_BATTERY_PERCENT
+        if percent is None or (percent < threshold) == found.battery_low:
+            return []
+        found.battery_low = not found.battery_low
+        if found.battery_low:
+            text = f"has {percent} % left in the battery of its instrument; change it"
+            return [_event(now_ns, "battery_low", text, station)]
+        return [_event(now_ns, "battery_recovered", f"has {percent} % in its battery again", station)]
 
     def clock_stepped(self, station: int, now_ns: int) -> EventRecord:
         """Return the event of a station's clock that was stepped or reset."""

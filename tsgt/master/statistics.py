@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from tsgt.estimation import usable
 from tsgt.master.link_events import NO_LINK
 from tsgt.model import PolarMeasurement, Status
+from tsgt.radio.superframe import UNKNOWN_CONDITION
 from tsgt.recording import StationStatus, StatusRecord
 
 if TYPE_CHECKING:
@@ -134,6 +135,7 @@ class _Station:
         while self.arrivals_ns and self.arrivals_ns[0] <= now_ns - RATE_WINDOW_NS:
             self.arrivals_ns.popleft()
         state = self.superframe
+        condition = UNKNOWN_CONDITION if state is None else state.condition
         return StationStatus(
             id=number,
             measurements=self.measurements,
@@ -156,6 +158,10 @@ class _Station:
             missed_slots=None if state is None else state.missed_slots,
             rejected_beacons=None if state is None else state.rejected_beacons,
             outside_lag_window=self.outside_lag_window,
+            battery_percent=condition.battery_percent,
+            atmospheric_ppm=condition.atmospheric_ppm,
+            activity=condition.activity,
+            problem=condition.problem,
             last_target_check_age_s=_age_s(self.checked_ns, now_ns),
         )
 

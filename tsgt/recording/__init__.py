@@ -27,6 +27,7 @@ from tsgt.recording.setup_record import (
     SetupStation,
 )
 from tsgt.recording.stream_records import (
+    LOW_BATTERY_PERCENT,
     PROTOCOL_VERSION,
     BeaconRecord,
     ClockRecord,
@@ -49,6 +50,7 @@ from tsgt.recording.writer import RecordingWriter
 
 __all__ = [
     "FORMAT_VERSION",
+    "LOW_BATTERY_PERCENT",
     "MAX_LINE_BYTES",
     "PROTOCOL_VERSION",
     "SETUP_START",

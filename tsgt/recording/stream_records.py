@@ -220,6 +220,10 @@ class PoseRecord(FiniteNumbers):
         return self.kind if self.delay_s is None else f"{self.kind}_{self.delay_s:g}s"
 
 
+LOW_BATTERY_PERCENT = 20
+"""An instrument's battery with less is about to be empty."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StationStatus(FiniteNumbers):
     """The status of one station."""
@@ -269,13 +273,30 @@ class StationStatus(FiniteNumbers):
     """Measurements that arrived after the poses of their time had been smoothed; only post-processing uses them. Null
     with the estimator linear."""
     battery_percent: int | None = None
-    """Charge of the instrument's battery; null where unknown, as over the radio today."""
+    """Charge of the instrument's battery in per cent; null where it does not report it, and with the protocol classic."""
     atmospheric_ppm: float | None = None
-    """Atmospheric correction that the instrument applies to distances, in 1e-6; null where unknown, as over the radio
-    today."""
+    """Atmospheric correction that the instrument applies to distances, in 1e-6, to 0.5 and from -127.5 to 127.5: the ends
+    mean that or beyond. Null where it does not report it, and with the protocol classic."""
+    activity: str | None = None
+    """What the instrument does now, for people; empty where there is no word for it, null where unknown, and with the
+    protocol classic."""
+    problem: str | None = None
+    """What requires the operator at the station, for people; empty where nothing does, null where unknown, and with the
+    protocol classic."""
     last_target_check_age_s: float | None = None
     """Time in s since ``tsgt calibrate check`` last found the station where it was calibrated; null if it never has, or
     last found that it has moved."""
+
+    @property
+    def action_required(self) -> str:
+        """What the operator has to do at the station although it may track, in words; empty for nothing."""
+        if (
+            not self.problem
+            and self.battery_percent is not None
+            and self.battery_percent < LOW_BATTERY_PERCENT
+        ):
+            return f"battery {self.battery_percent} %"
+        return self.problem or ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,7 @@ from tsgt import service
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RecordingError
 from tsgt.radio import Command, MeasureCommand
-from tsgt.radio.superframe import InstrumentState
+from tsgt.radio.superframe import UNKNOWN_CONDITION, InstrumentCondition, InstrumentState
 from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import RecordingHeader, RecordingWriter, decode, encode_line, new_recording_path
 from tsgt.recording.journal import InstrumentRecord, JournalRecord
@@ -209,6 +209,18 @@ class _StationClient:
             prism=self._session.prism,
             direct=self._session.mode == "direct",
             connected=self.supervisor.description is not None,
+            condition=self._instrument_condition(),
+        )
+
+    def _instrument_condition(self) -> InstrumentCondition:
+        if self.supervisor.description is None:
+            return UNKNOWN_CONDITION
+        condition, settings = self.supervisor.condition, self._settings()
+        return InstrumentCondition(
+            battery_percent=condition.battery_percent,
+            atmospheric_ppm=None if settings is None else settings.atmospheric_ppm,
+            activity=condition.activity,
+            problem=condition.problem,
         )
 
     # --- Control socket and systemd ---------------------------------------------------------------------------

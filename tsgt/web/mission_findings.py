@@ -36,7 +36,7 @@ FULL_DISK_BYTES = 50_000_000
 
 ALARMS = frozenset(
     {
-        "station_lost", "radio_failed", "geofence_exited", "layout_residual_high", "imu_setup_wrong", "imu_lost",
+        "station_lost", "battery_low", "radio_failed", "geofence_exited", "layout_residual_high", "imu_setup_wrong", "imu_lost",
         "beacon_time_rejected", "link_delay_anomaly", "unauthenticated", "station_contradicted", "disk_full", "disk_failed",
     }
 )  # fmt: skip
@@ -51,7 +51,7 @@ _END = {
 
 _GOOD_NEWS = frozenset(
     {
-        "station_recovered", "station_measuring", "station_tracking", "radio_recovered", "imu_setup_confirmed",
+        "station_recovered", "battery_recovered", "station_measuring", "station_tracking", "radio_recovered", "imu_setup_confirmed",
         "disk_recovered", "imu_recovered", "imu_plausible", "imu_used", "odometry_recovered", "odometry_agrees", "geofence_entered", "layout_residual_normal",
     }
 )  # fmt: skip
@@ -253,7 +253,12 @@ def station_findings(
         return []
     if _none_received(conditions):
         return [Finding(Level.CARE, NONE_RECEIVED, urgent=True)]
-    return [Finding(Level.CARE, text) for text in _stations_in_words(conditions)]
+    notes = [
+        f"station {station.id}: {station.action_required}"
+        for station in status.stations
+        if station.action_required and station.id in conditions and conditions[station.id].ok
+    ]
+    return [Finding(Level.CARE, text) for text in (*_stations_in_words(conditions), *notes)]
 
 
 def imu_findings(status: StatusRecord | None) -> list[Finding]:

@@ -88,6 +88,12 @@ def condition(station: StationStatus, elapsed_s: float, newest: Sight | None, no
     return Condition("tracking", LABELS[status])
 
 
+def note(station: StationStatus) -> str:
+    """Return what the station's client says of its instrument beyond that it tracks."""
+    activity = station.activity or ""
+    return station.action_required or ("" if activity == "tracking" else activity)
+
+
 def tile(
     station: StationStatus,
     setup: SetupStation | None,
@@ -103,6 +109,7 @@ def tile(
         "id": station.id,
         "state": found.state,
         "words": found.words,
+        "note": note(station),
         "prism": station.prism if station.prism is not None else setup.prism if setup else None,
         "rate_hz": rounded(station.rate_hz, 2),
         "range_m": rounded(newest.range_m, 3) if newest is not None and fresh else None,

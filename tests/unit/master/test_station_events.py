@@ -135,3 +135,16 @@ def test_delay_attack_is_an_event() -> None:
     assert (rejected.event, rejected.station, rejected.count) == ("beacon_time_rejected", 1, 3)
     anomaly = detector.link_delay_anomaly(1, START)
     assert (anomaly.event, anomaly.station) == ("link_delay_anomaly", 1)
+
+
+def test_low_battery_is_one_event_until_it_is_changed() -> None:
+    """Not one for each per cent around the threshold; what does not report its battery has none."""
+    detector = StationEventDetector([1], START)
+    percents = (85, 21, 20, 19, 20, 19, None, 29, 19, 30, 29, 12)
+    events = [event for percent in percents for event in detector.battery(1, percent, START)]
+    assert [(event.event, event.station) for event in events] == [
+        ("battery_low", 1),
+        ("battery_recovered", 1),
+        ("battery_low", 1),
+    ]
+    assert events[0].message == "station 1 has 19 % left in the battery of its instrument; change it"

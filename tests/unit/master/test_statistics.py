@@ -9,6 +9,7 @@ import pytest
 from tsgt.master.link_events import LinkStatus, SuperframeState
 from tsgt.master.statistics import Statistics
 from tsgt.model import PolarMeasurement, Status
+from tsgt.radio.superframe import InstrumentCondition
 from tsgt.timesync.two_way import ClockEstimate
 
 SECOND = 1_000_000_000
@@ -141,7 +142,14 @@ def test_superframe_state_is_reported() -> None:
         None,
     )
     statistics.superframe_state(
-        SuperframeState(2, joined=True, outstanding=3, missed_slots=4, rejected_beacons=5)
+        SuperframeState(
+            2,
+            joined=True,
+            outstanding=3,
+            missed_slots=4,
+            rejected_beacons=5,
+            condition=InstrumentCondition(battery_percent=85, atmospheric_ppm=8.5, activity="tracking"),
+        )
     )
     status = statistics.status(SECOND, LinkStatus(protocol="superframe", authenticated=True, frame_ms=378.5))
     assert (status.protocol, status.authenticated, status.frame_ms) == ("superframe", True, 378.5)
@@ -151,4 +159,10 @@ def test_superframe_state_is_reported() -> None:
         3,
         4,
         5,
+    )
+    assert (station.battery_percent, station.atmospheric_ppm, station.activity, station.problem) == (
+        85,
+        8.5,
+        "tracking",
+        None,
     )

@@ -80,7 +80,8 @@ def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:
     for station in record.stations:
         label, ok = station_label(station)
         blocks.append([_headline(f"STATION {station.id}  {label}", ok=ok), *_station_lines(station)])
-        problems += [] if ok else [f"station {station.id}: {label}"]
+        needed = station.action_required if ok else label
+        problems += [f"station {station.id}: {needed}"] if needed else []
     if record.imu is not None:
         label, ok = imu_label(record.imu)
         blocks.append([_headline(f"IMU  {label}", ok=ok), *_imu_lines(record.imu)])
@@ -223,6 +224,14 @@ def _station_lines(station: StationStatus) -> list[str]:
         "rejected beacons": station.rejected_beacons,
     }
     lines += [f"  {count} {name}" for name, count in counts.items() if count]
+    if station.battery_percent is not None:
+        lines.append(f"  battery {station.battery_percent} %")
+    if station.atmospheric_ppm is not None:
+        lines.append(f"  air {station.atmospheric_ppm:+.1f} ppm")
+    if station.activity and station.activity != "tracking":
+        lines += wrapped(station.activity, "  ")
+    if station.problem:
+        lines += [_headline(line, ok=False) for line in wrapped(station.problem, "  ")]
     if station.last_target_check_age_s is not None:
         lines.append(f"  targets checked {duration(station.last_target_check_age_s)} ago")
     return [line for line in lines if line.strip()]
@@ -302,7 +311,11 @@ def _reception_hints(record: ClientStatus) -> list[str]:
     if record.refused and record.unknown_packets:
         return [f"  {record.refused} beacons failed to authenticate:", "  compare the keys"]
     if record.unknown_packets:
-        return [f"  {record.unknown_packets} packets not decoded:", "  compare protocols and keys"]
+        return [
+            f"  {record.unknown_packets} packets not decoded:",
+            "  compare protocols, keys and software",
+            "  versions",
+        ]
     return ["  nothing received: master off, too far,", "  or other frequency, SF, bandwidth"]
 
 

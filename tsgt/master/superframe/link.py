@@ -182,6 +182,7 @@ class SuperframeLink:
                 outstanding=state.window.outstanding,
                 missed_slots=state.missed_slots,
                 rejected_beacons=state.rejected_beacons,
+                condition=state.condition,
             )
         )
         if reply.response is not None and isinstance(reply.command, TrackCommand):

@@ -6,6 +6,7 @@ stations reply in their slots. ``wire`` encodes and authenticates the messages.
 """
 
 from tsgt.radio.superframe.command_exchange import InstrumentState
+from tsgt.radio.superframe.condition import UNKNOWN_CONDITION, InstrumentCondition
 from tsgt.radio.superframe.demand import EXCHANGE_INTERVAL
 from tsgt.radio.superframe.master import SESSION_INTERVAL, SuperframeMaster
 from tsgt.radio.superframe.phase_lock import MIN_GAIN, MIN_MARGIN_NS, FramePlan, PhaseLock
@@ -24,9 +25,11 @@ __all__ = [
     "MIN_MARGIN_NS",
     "QUEUE_CAPACITY",
     "SESSION_INTERVAL",
+    "UNKNOWN_CONDITION",
     "BeaconReception",
     "FramePlan",
     "FrameTiming",
+    "InstrumentCondition",
     "InstrumentState",
     "PhaseLock",
     "QueuedMeasurement",

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
+from tsgt.radio.superframe.condition import UNKNOWN_CONDITION, ConditionReporter, InstrumentCondition
 from tsgt.radio.superframe.wire import decode_command
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class InstrumentState(NamedTuple):
     prism: int  # the tracked prism, or the last one before direct mode
     direct: bool  # it is in direct mode
     connected: bool
+    condition: InstrumentCondition = UNKNOWN_CONDITION  # reported in turn; no report waits for it
 
 
 class CommandExchange:
@@ -45,6 +47,7 @@ class CommandExchange:
         self._command_ids: frozenset[int] = frozenset()
         self._commands: deque[tuple[int, Command]] = deque()
         self._acknowledged: InstrumentState | None = None
+        self.conditions = ConditionReporter()
         # Prisms that the master may assume to be tracked, with the latest frame that reported them.
         self._reported_prisms: dict[int, int] = {}
         self._replies_without_turnaround = MAX_REPLIES_WITHOUT_TURNAROUND
@@ -70,7 +73,8 @@ class CommandExchange:
 
     def needs_report(self, state: InstrumentState) -> bool:
         """Whether the master may not know the state of the instrument."""
-        return state != self._acknowledged or any(prism != state.prism for prism in self._reported_prisms)
+        known = state._replace(condition=UNKNOWN_CONDITION) == self._acknowledged
+        return not known or any(prism != state.prism for prism in self._reported_prisms)
 
     @property
     def turnaround_overdue(self) -> bool:
@@ -93,6 +97,7 @@ class CommandExchange:
         """Take the reply of this frame as sent."""
         if reply.status_report is not None:
             self._reported_prisms[reply.status_report.prism] = counter
+            self.conditions.sent(reply.status_report.condition)
         has_turnaround = reply.turnaround_us is not None
         self._replies_without_turnaround = 0 if has_turnaround else self._replies_without_turnaround + 1
 
@@ -101,6 +106,7 @@ class CommandExchange:
         report = reply.status_report
         if report is not None:
             self._acknowledged = InstrumentState(report.prism, report.direct, report.connected)
+            self.conditions.acknowledged(report.condition)
             self._reported_prisms = {
                 prism: sent for prism, sent in self._reported_prisms.items() if sent > counter
             }

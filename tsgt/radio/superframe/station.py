@@ -226,7 +226,7 @@ class SuperframeStation:
         if session is None or session.slot is None:
             return None
         slot, session.slot = session.slot, None
-        report = self._status_report(instrument_state)
+        report = self._status_report(instrument_state, session)
         reply, sequences = self._builder.build(session, slot, instrument_state, report)
         if not session.confirmed and reply.join_request is None:
             return None  # the master could not authenticate it; it grants more to unknown stations
@@ -259,7 +259,7 @@ class SuperframeStation:
         ):
             session.last_reply.done_ns = transmission.done_at_ns
 
-    def _status_report(self, state: InstrumentState) -> StatusReport:
+    def _status_report(self, state: InstrumentState, session: StationSession) -> StatusReport:
         return StatusReport(
             prism=state.prism,
             direct=state.direct,
@@ -267,4 +267,5 @@ class SuperframeStation:
             missed_slots=self.missed_slots % 256,
             rejected_beacons=self.rejected_beacons % 16,
             rssi_dbm=min(max(round(self.rssi_dbm or 0), -127), 0),
+            condition=session.commands.conditions.next(state.condition),
         )

@@ -5,6 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.radio.commands import SearchCommand
+from tsgt.radio.superframe.condition import (
+    NO_INSTRUMENT,
+    UNKNOWN_CONDITION,
+    InstrumentCondition,
+    updated_condition,
+)
 from tsgt.radio.superframe.demand import DEFAULT_GRANT, grant
 from tsgt.radio.superframe.receive_window import ReceiveWindow
 from tsgt.radio.superframe.reception import ReceivedReply, TimedMeasurement
@@ -49,14 +55,23 @@ class StationState:
         self._confirmation_nonce: int | None = None
         self._join_counter = 0
         self._status: StatusReport | None = None
+        self._condition = UNKNOWN_CONDITION
         self._command_id = 0
         self._pending: _PendingCommand | None = None
 
     def reset_session(self) -> None:
         """Start a new session; what was received and recorded stays so."""
         self.nonce, self._confirmation_nonce, self._status = None, None, None
+        self._condition = UNKNOWN_CONDITION
         self.timing.reset()
         self.window.forget_replies()
+
+    @property
+    def condition(self) -> InstrumentCondition:
+        """Condition of its instrument, as far as reported in this session."""
+        if self._status is not None and not self._status.connected:
+            return InstrumentCondition(problem=NO_INSTRUMENT)
+        return self._condition
 
     def submit(self, command: Command) -> int:
         """Send a command, replacing a pending one; return its id."""
@@ -192,6 +207,7 @@ class StationState:
                 rejected = (status.rejected_beacons - self._status.rejected_beacons) % 16
                 self.rejected_beacons += rejected
             self._status = status
+            self._condition = updated_condition(self._condition, status.condition)
         return rejected
 
     def _complete(

@@ -194,6 +194,7 @@ function showStations(stations) {
       const head = child(tile, "h3");
       child(head, "span"); child(head, "span");
       child(tile, "p", "", "state");
+      child(tile, "p", "", "note");
       child(tile, "dl");
     }
     tile.className = `station ${station.state}`;
@@ -201,6 +202,7 @@ function showStations(stations) {
     text(name, `Station ${station.id}`);
     text(prism, station.prism ? `prism ${station.prism}` : "");
     text(tile.querySelector(".state"), station.words.charAt(0).toUpperCase() + station.words.slice(1));
+    text(tile.querySelector(".note"), station.note || "");
     const facts = [
       ["rate", given(station.rate_hz, "Hz", 1)],
       ["range", given(station.range_m, "m", 2)],

@@ -21,6 +21,7 @@ from tsgt.radio.superframe.wire.codec import (
 )
 from tsgt.radio.superframe.wire.messages import (
     ACK_FRAMES,
+    CONDITION_VALUE_BITS,
     GRANT_BYTES,
     MAX_NARROW_AGE_NS,
     RESTART_SKIP,
@@ -32,6 +33,7 @@ from tsgt.radio.superframe.wire.messages import (
     WIDE_TIME_BITS,
     Beacon,
     CommandResponse,
+    ConditionItem,
     EncodedCommand,
     EncodedDirection,
     EncodedMeasurement,
@@ -50,6 +52,7 @@ from tsgt.radio.superframe.wire.messages import (
 __all__ = [
     "ACK_FRAMES",
     "CODE_BYTES",
+    "CONDITION_VALUE_BITS",
     "GRANT_BYTES",
     "KEY_BYTES",
     "MAX_NARROW_AGE_NS",
@@ -63,6 +66,7 @@ __all__ = [
     "Authenticator",
     "Beacon",
     "CommandResponse",
+    "ConditionItem",
     "EncodedCommand",
     "EncodedDirection",
     "EncodedMeasurement",

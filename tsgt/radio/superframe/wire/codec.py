@@ -25,12 +25,15 @@ from tsgt.radio.superframe.wire.block_codec import (
     take_values,
 )
 from tsgt.radio.superframe.wire.messages import (
+    CONDITION_KIND_BITS,
+    CONDITION_VALUE_BITS,
     MAX_STATIONS,
     SINGLE_QUALITY,
     TURNAROUND_BITS,
     VERSION,
     Beacon,
     CommandResponse,
+    ConditionItem,
     EncodedCommand,
     EncodedDirection,
     JoinConfirmation,
@@ -246,6 +249,8 @@ def _put_parts(writer: BitWriter, reply: Reply) -> None:
         writer.put(report.missed_slots, 8)
         writer.put(report.rejected_beacons, 4)
         writer.put(-report.rssi_dbm, 7)
+        writer.put(report.condition.kind, CONDITION_KIND_BITS)
+        writer.put(report.condition.value, CONDITION_VALUE_BITS)
     if reply.turnaround_us is not None:
         writer.put(reply.turnaround_us, TURNAROUND_BITS)
     if response is not None:
@@ -270,6 +275,7 @@ def _take_extended(reader: BitReader) -> Reply:
                 missed_slots=reader.take(8),
                 rejected_beacons=reader.take(4),
                 rssi_dbm=-reader.take(7),
+                condition=ConditionItem(reader.take(CONDITION_KIND_BITS), reader.take(CONDITION_VALUE_BITS)),
             )
             if reports
             else None

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tsgt.model import Status
 
-VERSION = 1
+VERSION = 2
+"""A change that another version would misread is a new one; peers of different versions do not understand each other."""
 
 MAX_STATIONS = 16
 
@@ -36,6 +37,8 @@ SINGLE_QUALITY = 3  # quality of a reply of the form ``single``: bound 128 us
 RESTART_SKIP = 20_000
 """Sequence numbers that a restarted station skips: they may have been sent without having reached the journal.
 At 20 measurements per second they cover a quarter of an hour without a disk write."""
+
+CONDITION_KIND_BITS, CONDITION_VALUE_BITS = 2, 9
 
 TURNAROUND_BITS = 22  # width of a turnaround in us: at most 4.2 s
 
@@ -163,6 +166,14 @@ class JoinRequest:
     oldest: int  # 32 bits: lowest number that is not delivered, or the next to be assigned
 
 
+@dataclass(frozen=True, slots=True)
+class ConditionItem:
+    """One of the values that describe the condition of an instrument; see :mod:`tsgt.radio.superframe.condition`."""
+
+    kind: int  # 2 bits
+    value: int  # 9 bits; 0: unknown, or nothing to say
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusReport:
     """Status of a station."""
@@ -173,6 +184,7 @@ class StatusReport:
     missed_slots: int  # slots left empty because the reply was late; the low 8 bits
     rejected_beacons: int  # beacons rejected for an impossible time; the low 4 bits
     rssi_dbm: int  # of the last beacon, -127 to 0
+    condition: ConditionItem = ConditionItem(0, 0)
 
 
 @dataclass(frozen=True, slots=True)

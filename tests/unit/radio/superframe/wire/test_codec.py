@@ -7,10 +7,12 @@ import pytest
 
 from tsgt.errors import MessageError
 from tsgt.model import Status
+from tsgt.radio import LoRaSettings
 from tsgt.radio.superframe.wire import (
     GRANT_BYTES,
     Beacon,
     CommandResponse,
+    ConditionItem,
     EncodedCommand,
     EncodedDirection,
     EncodedMeasurement,
@@ -35,12 +37,19 @@ from tsgt.radio.superframe.wire import (
     reply_bytes,
 )
 from tsgt.radio.superframe.wire.bits import BitReader, BitWriter
+from tsgt.radio.superframe.wire.messages import VERSION
 
 SIGHTING = EncodedMeasurement(200, 100_000, Status.OK, 5_000_000, 4_194_304, 750_000)
 SINGLE = Reply(blocks=(MeasurementBlock(measurements=(SIGHTING,)),))
 INTRODUCTION = JoinRequest(nonce=0x89ABCDEF, stream_id=0x1234, first_sequence=2**32 - 1, oldest=2**32 - 1)
 STATE = StatusReport(
-    prism=16, direct=True, connected=True, missed_slots=255, rejected_beacons=15, rssi_dbm=-127
+    prism=16,
+    direct=True,
+    connected=True,
+    missed_slots=255,
+    rejected_beacons=15,
+    rssi_dbm=-127,
+    condition=ConditionItem(3, 511),
 )
 SESSION = SessionInfo(nonce=2**48 - 1, counter_high=1, sent_high=2, guard=3, turnaround=4)
 
@@ -99,6 +108,15 @@ def test_join_request_with_measurement_fits_default_grant() -> None:
         measurements=(SIGHTING,), beacon_relative=True, quality=15, wide=True, prism=16, far=True
     )
     assert reply_bytes(Reply(join_request=INTRODUCTION, status_report=STATE, blocks=(block,))) <= 44
+
+
+def test_condition_costs_no_airtime() -> None:
+    """It fills the code block of a reply with turnaround, status report and one measurement."""
+    reply = Reply(status_report=STATE, turnaround_us=0, blocks=SINGLE.blocks)
+    settings = LoRaSettings(frequency_hz=905_000_000, spreading_factor=9, bandwidth_hz=250_000, coding_rate=6)
+    length = reply_bytes(reply)
+    assert length == GRANT_BYTES[4] == 26
+    assert settings.airtime_ns(length) == settings.airtime_ns(length - 1)  # 11 bits, and 6 were padding
 
 
 # --- What comes back ---------------------------------------------------------------------------------------------
@@ -281,8 +299,8 @@ def _bits(*fields: tuple[int, int]) -> bytes:
     return writer.to_bytes()
 
 
-_PLAIN = ((1, 2), (7, 8), (0, 1), (9, 16), (3, 8), (0, 5))
-_EXTENDED = ((1, 2), (7, 8), (1, 1), (9, 16), (3, 8), (0, 5), (0, 4), (0x12, 8))
+_PLAIN = ((VERSION, 2), (7, 8), (0, 1), (9, 16), (3, 8), (0, 5))
+_EXTENDED = ((VERSION, 2), (7, 8), (1, 1), (9, 16), (3, 8), (0, 5), (0, 4), (0x12, 8))
 
 
 @pytest.mark.parametrize(
@@ -290,7 +308,7 @@ _EXTENDED = ((1, 2), (7, 8), (1, 1), (9, 16), (3, 8), (0, 5), (0, 4), (0x12, 8))
     [
         (b"", "cut off"),
         (_bits(*_PLAIN), "1 to 16 stations, got 0"),
-        (_bits((2, 2), *_PLAIN[1:], (0x12, 8)), "version 2"),
+        (_bits((1, 2), *_PLAIN[1:], (0x12, 8)), "version 1"),
         (_bits(*_EXTENDED, (0, 2)), "canonical form"),
         (_bits(*_EXTENDED, (3, 2), (0, 4), (0, 4), (0, 4), (0, 4), (0, 2), (1, 1)), "canonical form"),
         (_bits(*_EXTENDED, (3, 2), (1, 4), (0, 4), (0, 4), (0, 4), (0, 2)), "station 2"),
@@ -306,7 +324,7 @@ def test_malformed_beacons_are_rejected(content: bytes, message: str) -> None:
         decode_beacon(content)
 
 
-_HEADER = ((1, 2), (1, 2))
+_HEADER = ((VERSION, 2), (1, 2))
 _RUN = ((3, 4), (0, 1), (1, 4), (200, 8), (100_000, 17), (0, 3), (5, 24), (6, 24), (7, 24))
 
 
@@ -315,11 +333,11 @@ _RUN = ((3, 4), (0, 1), (1, 4), (200, 8), (100_000, 17), (0, 3), (5, 24), (6, 24
     [
         (b"", "cut off"),
         (_bits((0, 2), (1, 2)), "version 0"),
-        (_bits((1, 2), (3, 2)), "form 3"),
+        (_bits((VERSION, 2), (3, 2)), "form 3"),
         (_bits(*_HEADER, (1, 4)), "canonical form"),
-        (_bits((1, 2), (2, 2), (0, 5)), "canonical form"),
-        (_bits((1, 2), (0, 2), (200, 8), (5, 17), (7, 3), (0, 72)), "status 7"),
-        (_bits((1, 2), (0, 2), (200, 8), (5, 17), (0, 3), (0, 72), (0, 8)), "canonical form"),
+        (_bits((VERSION, 2), (2, 2), (0, 5)), "canonical form"),
+        (_bits((VERSION, 2), (0, 2), (200, 8), (5, 17), (7, 3), (0, 72)), "status 7"),
+        (_bits((VERSION, 2), (0, 2), (200, 8), (5, 17), (0, 3), (0, 72), (0, 8)), "canonical form"),
         (_bits(*_HEADER, (3, 4), (0, 1), (0, 4), (200, 8), (5, 17), (0, 3), (0, 72)), "canonical form"),
         (_bits(*_HEADER, *_RUN, (0, 1), (0, 10), (0, 9), (0, 9)), "cut off"),
         (_bits(*_HEADER, *_RUN, (0, 1), (1, 2), (0, 12), (0, 9), (0, 9), (0, 10)), "canonical form"),

@@ -195,7 +195,7 @@ def event(*names: str) -> Callable[[bytes], bool]:
 async def show(fault: Fault, watch: Watch, tabs: list[Tab], screenshots: Path | None) -> None:
     """Plant a fault, wait until all pages show it, and repair it."""
     waits_for_truth = fault.name == "fence crossed"
-    await shown(tabs, watch, "GOOD", GOOD_TIMEOUT_S)
+    await shown(tabs, watch, f"(?!{fault.shown})(GOOD|CARE)", GOOD_TIMEOUT_S)
     watch.expect(fault.told)
     planted_s = time.monotonic()
     await fault.plant()

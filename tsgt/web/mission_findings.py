@@ -40,14 +40,18 @@ ALARMS = frozenset(
         "beacon_time_rejected", "link_delay_anomaly", "unauthenticated", "station_contradicted", "disk_full", "disk_failed",
     }
 )  # fmt: skip
-"""Events that need the operator; those of ``_END`` end them."""
+"""Events that need the operator."""
 
 _END = {
-    "radio_recovered": "radio_failed",
-    "layout_residual_normal": "layout_residual_high",
-    "imu_setup_confirmed": "imu_setup_wrong",
+    "radio_failed": {"radio_recovered"},
+    "layout_residual_high": {"layout_residual_normal"},
+    "imu_setup_wrong": {"imu_setup_confirmed"},
+    "disk_full": {"disk_low", "disk_failed", "disk_recovered"},
+    "disk_failed": {"disk_low", "disk_full", "disk_recovered"},
 }
-"""Events that end a lasting state that no status tells."""
+"""Events that begin a lasting state that no status tells, or tells later, each with those that end it."""
+
+_URGENT = frozenset({"radio_failed", "disk_full", "disk_failed"})
 
 _GOOD_NEWS = frozenset(
     {
@@ -60,6 +64,8 @@ _FENCE = re.compile(r"geofence (.*?) (?:exited|entered)(: no valid pose)?")
 
 UNCONFIRMED = "the set-up of the IMU is not confirmed yet: drive curves, accelerate and brake"
 """The operator has to act: without that poses do without the IMU, or rest on one that may be set up wrongly."""
+
+DISK_FULL = "the disk is full"
 
 NONE_RECEIVED = "no station is received: the master's radio?"
 
@@ -84,10 +90,11 @@ class StandingEvents:
                 self._fences[fence[1]] = f"{where} the geofence {fence[1]}{fence[2] or ''}"
             else:
                 self._fences.pop(fence[1], None)
-        elif event.event in _END.values():
-            self._messages[event.event] = event.message
         elif event.event in _END:
-            self._messages.pop(_END[event.event], None)
+            self._messages[event.event] = DISK_FULL if event.event == "disk_full" else event.message
+        for begin, ends in _END.items():
+            if event.event in ends:
+                self._messages.pop(begin, None)
 
     def fences(self) -> list[Finding]:
         """Return the geofences that the robot has left, or may have left."""
@@ -101,8 +108,7 @@ class StandingEvents:
     def findings(self) -> list[Finding]:
         """Return the other lasting states."""
         return [
-            Finding(Level.CARE, message, urgent=name == "radio_failed")
-            for name, message in self._messages.items()
+            Finding(Level.CARE, message, urgent=name in _URGENT) for name, message in self._messages.items()
         ]
 
 
@@ -362,7 +368,7 @@ def storage_findings(status: StatusRecord | None) -> list[Finding]:
         found.append(
             Finding(
                 Level.CARE,
-                f"the disk is {'full' if full else 'nearly full'}: {free / 1e6:.0f} MB left",
+                f"{DISK_FULL if full else 'the disk is nearly full'}: {free / 1e6:.0f} MB left",
                 urgent=full,
             )
         )

@@ -317,6 +317,10 @@ class MissionState:
     def _conditions(self, now_s: float) -> dict[int, stations.Condition]:
         if self._status is None:
             return {}
+        if self._standing.radio_failure:  # nothing is known of them
+            return {
+                each.id: stations.Condition("silent", "the radio failed") for each in self._status.stations
+            }
         elapsed_s = now_s - self._status_s
         return {
             each.id: stations.condition(each, elapsed_s, self._sights.get(each.id), now_s)
@@ -403,5 +407,6 @@ def plain(text: str) -> str:
 
 
 def _without_repetition(items: list[Finding]) -> list[Finding]:
-    """Return the findings without those whose text another one has."""
-    return list({each.cause: each for each in reversed(items)}.values())[::-1]
+    """Return the findings without those whose text another one has, or begins with."""
+    once = list({each.cause: each for each in reversed(items)}.values())[::-1]
+    return [each for each in once if not any(o.cause.startswith(each.cause) for o in once if o is not each)]

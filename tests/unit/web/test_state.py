@@ -110,11 +110,27 @@ def test_failed_radio_is_the_cause_of_silent_stations() -> None:
     failure = "the radio of the master failed, no station can be reached: SPI timeout"
     silent = [station(number, last_heard_s=6.0, answering=False) for number in (1, 2, 3)]
     lost = pose(10.0, valid=False, reason="outage", quality="invalid")
-    feed(state, event("radio_failed", failure), status(10.0, *silent), lost, now_s=10.0)
+    feed(state, event("radio_failed", failure), status(10.0), now_s=10.0)
+    assert {each["state"] for each in state.view(10.0)["stations"]} == {"silent"}
+    feed(state, status(10.0, *silent), lost, now_s=10.0)
     assert verdict(state, 10.1) == ("NO POSE", failure)
     assert state.view(10.1)["alarms"] == []
     feed(state, status(12.0, *silent), now_s=12.0)
     assert verdict(state, 12.0) == ("NO POSE", f"no pose for 2 s: {failure}")
+
+
+def test_full_disk_is_told_by_its_event_already() -> None:
+    """Up to a second before the next status, which then says how much is left."""
+    state = running()
+    feed(state, event("disk_full", "the disk of the recording is full, 5 lines wait in memory"), now_s=10.1)
+    assert verdict(state, 10.2) == ("CARE", "the disk is full")
+    disk = DiskStatus(free_bytes=3_000_000, total_bytes=10**10)
+    feed(state, status(11.0, disk=disk), pose(11.0), now_s=11.0)
+    assert verdict(state, 11.1) == ("CARE", "the disk is full: 3 MB left")
+    assert state.view(11.1)["alarms"] == []
+    feed(state, event("disk_low", "0.9 GB are free"), status(12.0), pose(12.0), now_s=12.0)
+    feed(state, pose(13.2), status(13.2), now_s=13.2)
+    assert verdict(state, 13.3)[0] == "GOOD"
 
 
 def test_unconfirmed_imu_is_a_finding() -> None:

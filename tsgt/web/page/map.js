@@ -68,6 +68,7 @@ export class MissionMap {
     }
     if (this.last) points.push(this.last.at);
     if (!points.length) return;
+    if (this.follow && this.last) for (const [x, y] of [...points]) points.push([2 * this.last.at[0] - x, 2 * this.last.at[1] - y]);
     const xs = points.map((point) => point[0]), ys = points.map((point) => point[1]);
     const low = [Math.min(...xs), Math.min(...ys)], high = [Math.max(...xs), Math.max(...ys)];
     this.centre = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2];

@@ -180,17 +180,16 @@ def _slow_time_ns(table: NumberTable, row: int, cell: str, digits: int) -> int:
 def unit_of(values: FloatArray) -> TimeUnit:
     """Return the unit of times, (M,): Unix times by their size, times from zero on by the steps between them."""
     finite = values[np.isfinite(values)]
-    if not len(finite):
-        return "s"
-    for least, unit in _ABSOLUTE:
-        if np.median(finite) >= least:
-            return unit
-    steps = np.abs(np.diff(finite))
+    # Numbers of any size may stand here.
+    with np.errstate(over="ignore"):
+        steps = np.abs(np.diff(finite))
     steps = steps[steps > 0]
-    if len(steps):
-        for least, unit in _RELATIVE:
-            if np.median(steps) >= least:
-                return unit
+    for table, sizes in ((_ABSOLUTE, finite), (_RELATIVE, steps)):
+        if len(sizes):
+            typical = float(np.quantile(sizes, 0.5, method="lower"))
+            for least, unit in table:
+                if typical >= least:
+                    return unit
     return "s"
 
 

@@ -36,6 +36,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "merge": ("merge:merge", "Add the stations' journals to a recording."),
         "process": ("desk.process:process", "Compute poses from a recording."),
         "evaluate": ("desk.evaluate:evaluate", "Assess the accuracy of a recording."),
+        "compare": ("desk.compare:compare", "Compare estimates of other programs with the reference."),
         "export": ("exporting:export", "Convert a recording to TUM, CSV or MCAP."),
     },
     "Planning": {

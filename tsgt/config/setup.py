@@ -127,11 +127,11 @@ class SensorMountingFile(Model):
     kind: Literal["sensor_mounting"]
     """Kind of this file."""
     position_m: Place
-    """Origin of its axes in the axes of the reference's point, [x, y, z]."""
+    """Origin of its axes in the axes of the reference point, [x, y, z]."""
     orientation_xyzw: Row4 = (0.0, 0.0, 0.0, 1.0)
     """Unit quaternion [x, y, z, w] that rotates coordinates in its axes into those of the reference's point."""
     position_sigma_mm: tuple[NotNegative, NotNegative, NotNegative] | None = None
-    """One sigma of the position along each axis of the point; 0: exact. Without this key the position is unknown where it is fitted."""
+    """One sigma of the position along each axis of the reference point; 0: exact. Without this key the position is unknown where it is fitted."""
     rotation_sigma_deg: tuple[NotNegative, NotNegative, NotNegative] | None = None
     """One sigma of the rotation about each axis of the point; 0: exact. Without this key the rotation is unknown where it is fitted."""
     offset_ms: Annotated[float, Field(ge=-1e12, le=1e12)] = 0.0

@@ -4,29 +4,52 @@ Comes in: reference poses with covariance, estimates of other programs (poses or
 of their own point on the robot). Goes out: time offset, extrinsic and frame with uncertainties, and error statistics.
 """
 
+from tsgt.analysis.compare.assessment import Assessment, assess
 from tsgt.analysis.compare.checks import (
     InputFinding,
     input_findings,
     quaternion_finding,
     relative_offset_s,
 )
+from tsgt.analysis.compare.comparison import (
+    Comparison,
+    FitStep,
+    compare_estimate,
+    compare_estimates,
+    reference_keys,
+)
+from tsgt.analysis.compare.completeness import Completeness
+from tsgt.analysis.compare.error_table import error_csv
+from tsgt.analysis.compare.errors import TRAVEL_COMPONENTS, ErrorSeries, JudgedErrors
 from tsgt.analysis.compare.fitting import ExtrinsicPrior, FitSettings, fit, nested_fits
 from tsgt.analysis.compare.initialisation import overlap_s
 from tsgt.analysis.compare.pairing import PairedPoses, pair
+from tsgt.analysis.compare.reference_point import reference_at
 from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation, initial_relation
 from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
 
 __all__ = [
+    "TRAVEL_COMPONENTS",
     "Alignment",
+    "Assessment",
+    "Comparison",
+    "Completeness",
+    "ErrorSeries",
     "Estimate",
     "ExtrinsicPrior",
     "Fit",
     "FitSettings",
+    "FitStep",
     "FittedPart",
     "InputFinding",
+    "JudgedErrors",
     "PairedPoses",
     "ReferencePoses",
     "Relation",
+    "assess",
+    "compare_estimate",
+    "compare_estimates",
+    "error_csv",
     "fit",
     "initial_relation",
     "input_findings",
@@ -34,5 +57,7 @@ __all__ = [
     "overlap_s",
     "pair",
     "quaternion_finding",
+    "reference_at",
+    "reference_keys",
     "relative_offset_s",
 ]

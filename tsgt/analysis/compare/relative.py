@@ -83,8 +83,8 @@ def explained_motion(pairs: PairedPoses, rows: NDArray[np.intp]) -> Explained:
     own = covariance if common is None else covariance - common
     first, second = rows.T
     travelled = pairs.reference[second, :3, 3] - pairs.reference[first, :3, 3]
-    # An error of the first rotation turns the whole motion.
-    C, lever = own[first], skew(travelled)
+    # An error of the first rotation turns the whole motion; positions alone are given that rotation themselves.
+    C, lever = own[first], skew(travelled if pairs.has_orientation else np.zeros_like(travelled))
     turned = lever @ C[:, 3:, :3]
     position = (
         _trace(C[:, :3, :3])

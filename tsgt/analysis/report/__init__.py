@@ -7,18 +7,38 @@ verdicts, sections, page and numbers. matplotlib and jinja2 are imported when a 
 from tsgt.analysis.report.findings import Findings, collect_findings
 from tsgt.analysis.report.headline import headline
 from tsgt.analysis.report.numbers import report_numbers
-from tsgt.analysis.report.page import Headline, Images, render_page
+from tsgt.analysis.report.page import (
+    MAX_LISTED,
+    Headline,
+    Images,
+    ReportFigure,
+    Section,
+    Table,
+    format_cells,
+    format_number,
+    format_share,
+    format_utc,
+    render_page,
+)
 from tsgt.analysis.report.sections import sections
 from tsgt.analysis.report.stations import StationRecord
 from tsgt.analysis.report.trajectory_sections import map_figure
 from tsgt.analysis.report.verdicts import verdicts
 
 __all__ = [
+    "MAX_LISTED",
     "Findings",
     "Headline",
     "Images",
+    "ReportFigure",
+    "Section",
     "StationRecord",
+    "Table",
     "collect_findings",
+    "format_cells",
+    "format_number",
+    "format_share",
+    "format_utc",
     "headline",
     "map_figure",
     "render_page",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -29,13 +29,14 @@ from tsgt.errors import OutputFileError
 from tsgt.estimation import build_tracks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.analysis.diagnosis import Diagnosis
     from tsgt.analysis.evaluation import Align, InterPrismDistances, PoseErrorStatistics, Reference
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.refinement import Refine
+    from tsgt.analysis.report import Headline, ReportFigure, Section
     from tsgt.analysis.report.verdicts import Verdict
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.recording import Recording
@@ -154,11 +155,38 @@ def write_report(
     OutputFileError
         A file cannot be written.
     """
+    write_page(
+        folder,
+        f"Report of {findings.path.name}",
+        headline(findings),
+        map_figure(findings),
+        sections(findings),
+        report_numbers(findings),
+        on_progress=on_progress,
+    )
+
+
+def write_page(
+    folder: Path,
+    title: str,
+    head: Headline,
+    path_map: ReportFigure | None,
+    made: Sequence[Section],
+    figures: Mapping[str, Any],
+    *,
+    on_progress: Callable[[float], None] | None = None,
+) -> None:
+    """Write a page, its figures as PNG and PDF, and its numbers as JSON, into a folder.
+
+    Raises
+    ------
+    OutputFileError
+        A file cannot be written.
+    """
     from tsgt.analysis.figures import palette_png
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        made, path_map = sections(findings), map_figure(findings)
         plots = [*filter(None, [path_map]), *(plot for section in made for plot in section.plots)]
         images = {}
         for number, plot in enumerate(plots, start=1):
@@ -167,8 +195,8 @@ def write_report(
             images[plot.name] = Images(*map(palette_png, (files[0].read_bytes(), plot.narrow_png())))
             if on_progress is not None:
                 on_progress(number / len(plots))
-        text = render_page(f"Report of {findings.path.name}", headline(findings), path_map, made, images)
+        text = render_page(title, head, path_map, made, images)
         (folder / PAGE_NAME).write_text(text, encoding="utf-8")
-        (folder / NUMBERS_NAME).write_text(json_text(report_numbers(findings)) + "\n", encoding="utf-8")
+        (folder / NUMBERS_NAME).write_text(json_text(figures) + "\n", encoding="utf-8")
     except OSError as error:
         raise OutputFileError(error.strerror or str(error), path=folder) from error

@@ -159,3 +159,15 @@ def test_too_few_poses_have_no_segments() -> None:
         found = drift(paired(ESTIMATED[:count], TRUE[:count]))
         assert found.segments == ()
         assert math.isnan(found.position_mm_per_m)
+
+
+def test_rotation_of_the_reference_does_not_show_in_positions() -> None:
+    """The motion of positions alone is compared in the axes of the reference on both sides."""
+    covariance = np.diag([0.003] * 3 + [0.01] * 3) ** 2
+    reference = noisy(TRUE, np.random.default_rng(8), position_m=0.003, rotation_rad=0.01)
+    estimated = reference.copy()
+    estimated[:, :3, 3] = TRUE[:, :3, 3]
+    pairs = paired(estimated[:2000], reference[:2000], covariance=covariance, has_orientation=False)
+    (over_10_s,) = (each for each in relative(pairs) if (each.delta, each.unit) == (10.0, "s"))
+    assert over_10_s.judged.explained.position_rms_mm == pytest.approx(3.0 * math.sqrt(6.0))
+    assert over_10_s.judged.errors.position_mm.rms == pytest.approx(3.0 * math.sqrt(6.0), rel=0.05)

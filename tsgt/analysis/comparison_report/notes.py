@@ -1,0 +1,58 @@
+"""What a reader must know of a comparison, in sentences."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tsgt.analysis.compare import Comparison
+
+
+def notes(each: Comparison) -> list[str]:
+    """Return what limits the figures of a comparison, a sentence each."""
+    lines = [*each.estimate.notes, *each.warnings]
+    undetermined = [name for name in each.unobservable if not _meaningless(each, name)]
+    if undetermined:
+        names = ", ".join(component_text(name) for name in undetermined)
+        lines.append(f"undetermined by this motion, left as given: {names}")
+    lines += _left_out(each)
+    c = each.errors.completeness
+    if c.diverged_s is not None:
+        lines.append(f"diverged {c.diverged_s:.0f} s after its start; all figures include that")
+    if c.jumps:
+        worst = max(c.jumps, key=lambda jump: jump.position_m)
+        plural = "s, the largest" if len(c.jumps) > 1 else ""
+        lines.append(f"{len(c.jumps)} jump{plural} of {1e3 * worst.position_m:.0f} mm")
+    fair = each.steps[each.smallest_fair]
+    own = each.errors.ate.errors.position_mm.rms
+    if "extrinsic" in fair.settings.parts - each.settings.parts:
+        lines.append(
+            f"the extrinsic is not fitted: with it the error falls from {own:.1f} to {fair.ate.errors.position_mm.rms:.1f} mm; "
+            "use `--fit offset,extrinsic`, or `--extrinsic FILE`"
+        )
+    if each.errors.drift.shortened and each.errors.drift.segments:
+        longest = each.errors.drift.segments[-1].length_m
+        lines.append(
+            f"the path is too short for KITTI's segments; drift is over segments of up to {longest:g} m"
+        )
+    return lines
+
+
+def _left_out(each: Comparison) -> list[str]:
+    c = each.errors.completeness
+    reasons = (
+        (c.outside, "before or after the reference"),
+        (c.reference_gap, "where the reference is invalid"),
+        (c.reference_weak, "where the reference is less certain than asked for"),
+    )
+    return [f"{count} of {c.poses} poses left out {where}" for count, where in reasons if count]
+
+
+def _meaningless(each: Comparison, name: str) -> bool:
+    """Return whether an unknown does not exist: a position has no axes."""
+    return each.estimate.orientation_xyzw is None and name.startswith("extrinsic") and name.endswith("_rad")
+
+
+def component_text(name: str) -> str:
+    """Return a name of a fitted unknown in words: ``extrinsic_z_m`` is "extrinsic z"."""
+    return name.rsplit("_", 1)[0].replace("_", " ") if name.endswith(("_m", "_rad", "_s")) else name

@@ -113,6 +113,11 @@ ENABLED = {
     "SupplementaryGroups": "spi gpio dialout",
     "ProtectSystem": "strict",
     "StateDirectory": "tsgt",
+    "ProtectHome": "yes",
+    "PrivateNetwork": "yes",
+    "RestrictAddressFamilies": "AF_UNIX",
+    "IPAddressAllow": "",
+    "IPAddressDeny": "0.0.0.0/0 ::/0",
 }
 
 
@@ -129,6 +134,10 @@ class FakeMachine:
         What other commands print, by all their words.
     here, daemon
         The user who runs the checks, and the one who runs the service.
+    unreached
+        What is wrong with the web server of the alarms.
+    reached
+        Addresses that were connected to.
     holders
         Who has a device open, by its name.
     port
@@ -152,6 +161,8 @@ class FakeMachine:
         self.start_odometry: StartProgram | None = None
         self.status: ClientStatus | None = None
         self.served: set[Path] = set()
+        self.unreached = ""
+        self.reached: list[str] = []
         self.hal_error: Exception | None = None
         self.port: OpenPort = self._nothing_answers
         self._make_system()
@@ -195,7 +206,11 @@ class FakeMachine:
             find_user=lambda _name, _groups: self.daemon,
             group_name=lambda gid: "dialout" if gid else "root",
             run=self._run,
-            which=lambda program: f"/usr/bin/{program}" if program in self.programs else None,
+            which=lambda program: (
+                f"{'' if program.startswith('/') else '/usr/bin/'}{program}"
+                if program in self.programs
+                else None
+            ),
             free_bytes=lambda _folder: self.free_bytes,
             start_imu=self.start_imu,
             start_odometry=self.start_odometry,
@@ -205,6 +220,7 @@ class FakeMachine:
             open_hal=self._open_hal,
             client_status=self.ask_client,
             serves=lambda path: path in self.served,
+            reach=self._reach,
         )
 
     async def run_checks(self, name: str = "client.toml") -> dict[str, Finding]:
@@ -217,6 +233,10 @@ class FakeMachine:
     def ask_client(self, _path: Path) -> ClientStatus | None:
         """Return the status of the client."""
         return self.status
+
+    def _reach(self, url: str) -> str:
+        self.reached.append(url)
+        return self.unreached
 
     def _make_system(self) -> None:
         for name in ("dev/spidev0.0", "dev/gpiochip0", "dev/ttyUSB0"):

@@ -22,6 +22,7 @@ from tsgt.doctor import (
     find_user,
     free_bytes,
     group_name,
+    reach_server,
     run_checks,
     run_command,
 )
@@ -119,6 +120,7 @@ def this_machine() -> Machine:
         open_hal=open_hal,
         client_status=_client_status,
         serves=_is_served,
+        reach=reach_server,
     )
 
 

@@ -6,7 +6,15 @@ users and the radio's bus. Out come findings: one line each, with what is wrong 
 
 from tsgt.doctor.checklist import run_checks
 from tsgt.doctor.finding import Finding, Outcome
-from tsgt.doctor.machine import Machine, current_user, find_user, free_bytes, group_name, run_command
+from tsgt.doctor.machine import (
+    Machine,
+    current_user,
+    find_user,
+    free_bytes,
+    group_name,
+    reach_server,
+    run_command,
+)
 
 __all__ = [
     "Finding",
@@ -16,6 +24,7 @@ __all__ = [
     "find_user",
     "free_bytes",
     "group_name",
+    "reach_server",
     "run_checks",
     "run_command",
 ]

@@ -12,6 +12,7 @@ from tsgt.doctor.finding import Finding, failed, note, ok, skipped
 from tsgt.doctor.imu import check_imu
 from tsgt.doctor.instrument import DaemonState, check_instrument
 from tsgt.doctor.odometry import check_odometry
+from tsgt.doctor.outgoing import check_alarms, check_geofence_commands
 from tsgt.errors import TsgtError
 
 if TYPE_CHECKING:
@@ -103,6 +104,8 @@ def _master_checks(
     yield "setup", partial(files.check_setup, machine, config)
     yield "imu", partial(check_imu, machine, config.imu, daemon=daemon.running)
     yield "odometry", partial(check_odometry, machine, config.odometry, daemon=daemon.running)
+    yield "geofence_command", partial(check_geofence_commands, machine, config.geofences, service)
+    yield "alarms", partial(check_alarms, machine, config.alarms, service)
     yield from _common_checks(machine, path, config, service, daemon)
 
 

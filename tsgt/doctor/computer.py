@@ -23,7 +23,8 @@ GOOD_CLOCK_SOURCES = {"arch_sys_counter", "tsc", "timer", "kvm-clock", "stc"}
 
 _PROPERTIES = (
     "LoadState,UnitFileState,ActiveState,SubState,User,SupplementaryGroups,ExecStart,"
-    "ProtectSystem,StateDirectory,ReadWritePaths"
+    "ProtectSystem,ProtectHome,StateDirectory,ReadWritePaths,"
+    "PrivateNetwork,RestrictAddressFamilies,IPAddressAllow,IPAddressDeny"
 )
 
 

@@ -6,11 +6,13 @@ import grp
 import os
 import pwd
 import shutil
+import socket
 import stat
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -65,6 +67,7 @@ class Machine:
     open_port, open_hal : Open a serial line; bus and pins of a radio.
     client_status : Returns the status of the client behind a socket; None without one. Raises StreamError if it is stuck.
     serves : Whether a process serves a socket.
+    reach : Connects to the web server of an address, without a request; returns what went wrong, or an empty string.
     """
 
     dev: Path = Path("/dev")
@@ -86,6 +89,7 @@ class Machine:
     open_hal: Callable[[Wiring], Hal]
     client_status: Callable[[Path], ClientStatus | None]
     serves: Callable[[Path], bool]
+    reach: Callable[[str], str]
 
     def read(self, path: Path) -> str | None:
         """Return the content of a system file; None if it cannot be read."""
@@ -142,3 +146,23 @@ def free_bytes(folder: Path) -> int:
     """Return the free space of a folder's disk for users in bytes; raises OSError."""
     found = os.statvfs(folder)
     return found.f_bavail * found.f_frsize
+
+
+def reach_server(url: str) -> str:
+    """Connect to the web server of an address, without a request; return what went wrong, or an empty string."""
+    import ssl  # noqa: PLC0415 (only where it is configured)
+
+    parts = urlsplit(url)
+    host, secure = parts.hostname or "", parts.scheme == "https"
+    try:
+        with socket.create_connection(
+            (host, parts.port or (443 if secure else 80)), COMMAND_TIMEOUT_S
+        ) as connection:
+            if secure:
+                with ssl.create_default_context().wrap_socket(connection, server_hostname=host):
+                    pass
+    except ssl.SSLCertVerificationError as error:
+        return f"its certificate is not accepted ({error.verify_message})"
+    except (OSError, ValueError) as error:
+        return f"it is not reached ({error})"
+    return ""

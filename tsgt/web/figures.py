@@ -33,7 +33,9 @@ def figures(
         "smoothed": _sigmas(smoothed),
         "delay_s": smoothed.delay_s if smoothed is not None else None,
         "sigma_limit_mm": None if limits is None else _mm(limits.predicted_position_sigma_m),
+        "rotation_limit_deg": None if limits is None else _deg(limits.predicted_rotation_sigma_rad),
         "smoothed_limit_mm": None if limits is None else _mm(limits.position_sigma_m),
+        "smoothed_rotation_limit_deg": None if limits is None else _deg(limits.rotation_sigma_rad),
         "residual_mm": None if fresh is None else _mm(fresh.residual_m),
         "residual_limit_mm": None if limits is None else _mm(limits.residual_m),
         "valid_share": rounded(share, 3),
@@ -56,3 +58,7 @@ def _sigmas(record: PoseRecord | None) -> dict[str, float | None] | None:
 
 def _mm(length_m: float | None) -> float | None:
     return None if length_m is None else rounded(1e3 * length_m, 1)
+
+
+def _deg(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else rounded(math.degrees(angle_rad), 2)

@@ -60,6 +60,16 @@ def test_stream_without_poses_is_no_green() -> None:
     assert view["figures"]["live"] is None
 
 
+def test_sigmas_have_both_limits() -> None:
+    """A pose can be uncertain by its rotation alone."""
+    limits = replace(
+        SETUP.limits, predicted_position_sigma_m=0.15, predicted_rotation_sigma_rad=math.radians(5)
+    )
+    shown = running(replace(SETUP, limits=limits)).view(10.1)["figures"]
+    assert (shown["sigma_limit_mm"], shown["rotation_limit_deg"]) == (150.0, 5.0)
+    assert shown["live"] == {"position_mm": 1.0, "rotation_deg": 0.06}
+
+
 def test_late_lines_are_no_live_view() -> None:
     """Lines that have waited on their way look like those of now; their stamps say otherwise."""
     state = running()

@@ -161,6 +161,12 @@ function graded(value, limit) {
   return value > limit ? "bad" : value > limit / 2 ? "warn" : "ok";
 }
 
+// Position and rotation, the worse of them.
+function gradedSigmas(sigmas, limit_mm, limit_deg) {
+  const grades = [graded(sigmas.position_mm, limit_mm), graded(sigmas.rotation_deg, limit_deg)];
+  return ["bad", "warn", "ok"].find((grade) => grades.includes(grade)) || "";
+}
+
 function length(mm) {
   if (mm === null || mm === undefined) return "–";
   return mm < 10 ? `${mm.toFixed(1)} mm` : mm < 1000 ? `${mm.toFixed(0)} mm` : `${(mm / 1000).toFixed(1)} m`;
@@ -168,10 +174,10 @@ function length(mm) {
 
 function showFigures(f) {
   const rotation = (sigmas) => sigmas && sigmas.rotation_deg !== null ? `${sigmas.rotation_deg.toFixed(2)}°` : "";
-  const limit = (mm) => mm ? `, limit ${mm.toFixed(0)} mm` : "";
+  const limit = (mm, deg) => mm ? `, limit ${mm.toFixed(0)} mm${deg ? `, ${Number(deg.toFixed(1))}°` : ""}` : "";
   const live = f.live || {}, later = f.smoothed || {};
-  figure("f-sigma", length(live.position_mm), rotation(f.live) + (f.live ? limit(f.sigma_limit_mm) : ""), graded(live.position_mm, f.sigma_limit_mm));
-  figure("f-later", length(later.position_mm), f.smoothed ? rotation(f.smoothed) + (f.delay_s ? `, ${f.delay_s} s later` : ", final") : "", graded(later.position_mm, f.smoothed_limit_mm));
+  figure("f-sigma", length(live.position_mm), rotation(f.live) + (f.live ? limit(f.sigma_limit_mm, f.rotation_limit_deg) : ""), gradedSigmas(live, f.sigma_limit_mm, f.rotation_limit_deg));
+  figure("f-later", length(later.position_mm), f.smoothed ? rotation(f.smoothed) + (f.delay_s ? `, ${f.delay_s} s later` : ", final") : "", gradedSigmas(later, f.smoothed_limit_mm, f.smoothed_rotation_limit_deg));
   figure("f-fit", length(f.residual_mm), f.residual_limit_mm ? `limit ${f.residual_limit_mm.toFixed(0)} mm` : "", graded(f.residual_mm, f.residual_limit_mm));
   const share = f.valid_share;
   figure("f-valid", share === null || share === undefined ? "–" : `${(Math.floor(1000 * share) / 10).toFixed(share === 1 ? 0 : 1)} %`,

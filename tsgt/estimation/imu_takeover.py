@@ -17,6 +17,7 @@ from tsgt.estimation.inertial import SampleConverter
 from tsgt.estimation.odometry import WheelConverter
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial import DISAGREES_WITH_PRISMS
+from tsgt.geometry.trajectory import AMBIGUITY_MARGIN_S
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 """
 
 _POSE_DIM = 6
+_AFTER_FIRST_S = 0.01  # Sooner than the next measurement of a prism
 
 MAX_NIS, MAX_LASTING_NIS = 60.0, 30.0
 """Squared distance of the poses with IMU from those without, in sigmas of the latter, at once and in two checks half a second
@@ -281,8 +283,8 @@ class ImuTakeover:
 
     @property
     def horizon_s(self) -> float:
-        """Start of the later window: earlier measurements are rejected."""
-        return max(self._with.horizon_s, self._without.horizon_s)
+        """Start of the window without IMU: earlier measurements are rejected, as if there were no IMU."""
+        return self._without.horizon_s
 
     @property
     def held(self) -> int:
@@ -325,7 +327,10 @@ class ImuTakeover:
 
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time."""
-        self._with.update(new)
+        # A window that was begun anew starts with the samples since; measurements from before still arrive.
+        within = new.time_s >= self._with.horizon_s
+        if within.any():
+            self._with.update(new if within.all() else new.select(within))
         self._waiting.append(new)
         if self.use != ImuUse.USED:
             self._update_without()
@@ -371,7 +376,8 @@ class ImuTakeover:
     def _watch_station(self, found: ImuUse) -> None:
         """Note whether measurements of the only prism contradicted the IMU, and are followed from then on.
 
-        A wrong one among right ones is an outlier, which is not followed.
+        A wrong one among right ones is an outlier, which is not followed. One alone that is followed is within what is possible: a
+        station that has moved contradicts with the next one too.
         """
         rejected = found == ImuUse.DISAGREES and DISAGREES_WITH_PRISMS in self._contradiction
         followed = False
@@ -379,7 +385,9 @@ class ImuTakeover:
             self._ambiguous_from_s = min(self._ambiguous_from_s, self._with.ambiguous_from_s)
         elif self._with.converged:
             if np.isfinite(self._ambiguous_from_s):
-                followed = bool(self._with.ambiguous_at(np.array([self._ambiguous_from_s + 1.0]))[0])
+                # From before the first that contradicted to the last: one in a thousand does so by chance, and no other.
+                after_first_s = self._ambiguous_from_s + AMBIGUITY_MARGIN_S + _AFTER_FIRST_S
+                followed = bool(self._with.ambiguous_at(np.array([after_first_s]))[0])
             self._ambiguous_from_s = np.inf
         self.station_contradicted |= self._established and (followed or rejected)
         self._established |= self._with.converged and not self._with.ambiguous

@@ -26,7 +26,7 @@ from tsgt.estimation.imu_takeover import (
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial import WheelsEstimate
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
-from tsgt.geometry.trajectory import FixedLagSmoother
+from tsgt.geometry.trajectory import AMBIGUITY_MARGIN_S, FixedLagSmoother
 from tsgt.model import ImuSamples, Measurement, OdometryParameters, OdometrySamples
 from tsgt.recording import PoseRecord, encode_line
 
@@ -194,6 +194,31 @@ def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any],
     assert len(FakeInertialSmoother.created) == 2
 
 
+def test_poses_after_a_takeover_are_those_of_an_estimator_without_imu(scene: Scene) -> None:
+    """To the bit: measurements from before the takeover still arrive, though the window with the IMU has begun anew after them."""
+    live = checked(scene)
+    poses: list[PoseRecord] = []
+    arrived = arrivals(scene, 5.0)
+    for each in arrived:
+        if each.received_ns > START + 2 * SECOND and len(FakeInertialSmoother.created) == 1:
+            FakeInertialSmoother.created[0].health = "it is stuck"
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += [pose for pose in found if isinstance(pose, PoseRecord)]
+        if len(FakeInertialSmoother.created) > 1:
+            FakeInertialSmoother.created[-1]._horizon_s = 2.5  # of its first sample
+    without = replace(scene, parameters=replace(scene.parameters, imu=None))
+    others = [pose for pose in records(without, arrived) if isinstance(pose, PoseRecord)]
+    expected = {(pose.series, pose.stamp_ns): pose for pose in others}
+    # Samples advance the estimator too: at the last instant a measurement counts a call later without them.
+    taken_over = [pose for pose in poses if pose.imu == "disagrees" and time_of(pose) < 4.95]
+    assert len(taken_over) > 20
+    for pose in taken_over:
+        other = expected[pose.series, pose.stamp_ns]
+        assert pose.position_m == other.position_m
+        assert pose.covariance == other.covariance
+        assert pose.valid == other.valid
+
+
 def test_wrong_setup_is_left_out_from_its_event_on(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses do not rest on an IMU that a drive has shown to be set up wrongly."""
     wrong = SetupCheck((SetupFinding("rotation", 0.02, 0.001, "the mounting is wrong"),))
@@ -336,25 +361,28 @@ STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
 
 
 @pytest.mark.parametrize(
-    ("prisms", "followed", "health", "contradicted"),
+    ("prisms", "followed_for_s", "health", "contradicted"),
     [
-        (1, True, None, True),
-        (1, False, None, False),
-        (2, True, None, False),
-        (1, False, DISAGREES, True),
-        (1, False, STUCK, False),
-        (2, False, DISAGREES, False),
+        (1, 0.4, None, True),
+        (1, 0.0, None, False),
+        (1, None, None, False),
+        (2, 0.4, None, False),
+        (1, None, DISAGREES, True),
+        (1, None, STUCK, False),
+        (2, None, DISAGREES, False),
     ],
 )
 def test_contradiction_of_the_only_station_lasts(
-    prisms: int, *, followed: bool, health: str | None, contradicted: bool
+    prisms: int, followed_for_s: float | None, health: str | None, *, contradicted: bool
 ) -> None:
-    """Where the trajectory follows what contradicted the IMU; an outlier, or an IMU that is stuck, is none."""
+    """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
     window.setup_in_doubt = False
     window.ambiguous_from_s = 2.5
-    window.ambiguous_at = lambda time_s: np.array([followed]) & (time_s > window.ambiguous_from_s)
+    first_s = window.ambiguous_from_s + AMBIGUITY_MARGIN_S
+    until_s = -np.inf if followed_for_s is None else first_s + followed_for_s
+    window.ambiguous_at = lambda time_s: (time_s >= window.ambiguous_from_s) & (time_s <= until_s)
     takeover = ImuTakeover(IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), prisms=prisms)
     takeover.begin(START)
     found = []

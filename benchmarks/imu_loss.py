@@ -106,7 +106,7 @@ class Compared:
 def draw(group: str, rng: np.random.Generator, duration_s: float) -> list[Fault]:
     """Draw the faults of a group, one after the other."""
     kinds = list(GROUPS[group])
-    found = []
+    found: list[Fault] = []
     start_s = START_S
     while start_s + INTERVAL_S[group] <= duration_s or not found:
         if len(found) % len(kinds) == 0:

@@ -6,6 +6,7 @@ as ssh rejects private keys.
 
 from __future__ import annotations
 
+import itertools
 import os
 import pwd
 import re
@@ -32,8 +33,8 @@ def read_key(path: Path, *, owner: int | None = None, make_key: str = MAKE_KEY) 
     """Read a key.
 
     ``path``: a file made by :func:`write_key`, or a copy of it. ``owner``: required user id; None: that of this
-    process. ``make_key``: the command that makes such a file, for errors. Raises ConfigError if there is no such file, another user owns it or may read, write or replace it, or its
-    content is no key.
+    process. ``make_key``: the command that makes such a file, for errors. Raises ConfigError if there is no such file, another user
+    owns it or may read, write or replace it, or its content is no key that a random generator can have made.
     """
     try:
         # Opening a pipe must not block.
@@ -61,7 +62,22 @@ def read_key(path: Path, *, owner: int | None = None, make_key: str = MAKE_KEY) 
             "another computer that has it",
             path=path,
         )
-    return bytes.fromhex(content.decode("ascii"))
+    key = bytes.fromhex(content.decode("ascii"))
+    if not _random(key):
+        raise ConfigError(
+            f"{path}: its digits follow a pattern, which anybody can guess; make a random key with `{make_key}`, and copy it to "
+            "all computers",
+            path=path,
+        )
+    return key
+
+
+def _random(key: bytes) -> bool:
+    """Return whether a random generator can have made it; of its keys, fewer than one in 10^12 is taken for none."""
+    steps = {(later - earlier) % 256 for earlier, later in itertools.pairwise(key)}
+    repeats = any(key == (key[:period] * KEY_BYTES)[:KEY_BYTES] for period in range(1, KEY_BYTES // 2 + 1))
+    text = all(32 <= byte < 127 for byte in key)  # Of a sentence
+    return len(set(key)) > KEY_BYTES // 2 and len(steps) > 2 and not repeats and not text
 
 
 def write_key(path: Path) -> None:

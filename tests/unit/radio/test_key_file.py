@@ -33,6 +33,32 @@ def test_keys_are_random(key: Path, tmp_path: Path) -> None:
     assert read_key(key) != read_key(tmp_path / "other.key")
 
 
+@pytest.mark.parametrize(
+    "made_up",
+    [
+        bytes(KEY_BYTES),
+        b"\xff" * KEY_BYTES,
+        bytes.fromhex("0123456789abcdef") * (KEY_BYTES // 8),
+        bytes(range(KEY_BYTES)),
+        bytes(range(KEY_BYTES, 0, -1)),
+        b"correct horse battery staple 123"[:KEY_BYTES],
+    ],
+    ids=["zeros", "ones", "repeat", "up", "down", "sentence"],
+)
+def test_key_that_no_generator_made_is_rejected(key: Path, made_up: bytes) -> None:
+    """Anybody can guess it."""
+    key.write_text(made_up.hex() + "\n")
+    with pytest.raises(ConfigError, match="its digits follow a pattern"):
+        read_key(key)
+
+
+def test_made_keys_are_accepted(tmp_path: Path) -> None:
+    """Whatever the generator draws."""
+    for number in range(50):
+        write_key(tmp_path / f"{number}.key")
+        assert len(read_key(tmp_path / f"{number}.key")) == KEY_BYTES
+
+
 def test_key_is_not_overwritten(key: Path) -> None:
     """An existing key file stays unchanged."""
     before = key.read_text()

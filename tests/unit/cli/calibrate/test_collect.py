@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from tsgt.radio import RadioOpener
     from tsgt.station import Reading
 
-KEY = bytes(range(32))
+KEY = hashlib.sha256(b"a key").digest()
 TARGETS = np.array([[20.0, 3.0, 0.5], [5.0, 18.0, -0.5], [-14.0, 9.0, 1.0], [-8.0, -16.0, 0.2]])
 STATIONS = (1, 2, 3)
 

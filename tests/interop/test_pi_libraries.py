@@ -28,7 +28,7 @@ def examine() -> Any:
         if not python.exists():
             pytest.skip(f"no {python.relative_to(ROOT)}: run `make test-libs`")
         if name not in results:
-            script = Path(__file__).parent / "pi_libraries" / "examine.py"
+            script = Path(__file__).parent / "examine_pi_libraries.py"
             environment = {**os.environ, "PYTHONPATH": str(ROOT), "RPI_LGPIO_REVISION": REVISION_OF_A_PI_4}
             done = subprocess.run(
                 [python, script, str(hal.__file__), name],

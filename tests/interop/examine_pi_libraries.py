@@ -1,6 +1,6 @@
 """Examine the packages of a Raspberry Pi that are installed here, and what tsgt makes of their failures; prints JSON.
 
-Usage: examine.py HAL RPI-MODULE, with the path of tsgt/radio/sx127x/hal.py. It runs in an environment that has these packages alone.
+Usage: examine_pi_libraries.py HAL RPI-MODULE, with the path of tsgt/radio/sx127x/hal.py. It runs in an environment that has these packages alone.
 """
 
 from __future__ import annotations

@@ -6,6 +6,9 @@
 //       if (const auto* pose = std::get_if<tsgt::Pose>(&*record)) ...
 //     if (const tsgt::Pose* pose = stream.latest(0.2)) ...               // null while the newest one is older than 0.2 s
 //
+// It has no TLS: the relay's key keeps strangers out and lines unchanged, but everybody on the network can read them. To encrypt:
+// `ssh -N -L 27690:127.0.0.1:27690 robot`, and relay://127.0.0.1 here.
+//
 // It connects again by itself, goes on after the last line that it has got from a relay, and tells what is missing (Gap).
 // docs/reference/stream.md has the fields with units and frames, docs/reference/relay.md the relay's protocol.
 // Not for several threads at once. Nothing here waits longer than it is told to, but for the look-up of a name: give numeric

@@ -161,6 +161,14 @@ def test_other_streams_are_errors(program: Path, tmp_path: Path, data: bytes, er
     assert error in done.stderr
 
 
+def test_tls_is_refused_with_the_way_to_encrypt(program: Path) -> None:
+    """A relay with a certificate is not taken for a socket's path."""
+    command = [str(program), "relays://127.0.0.1", "relay.key"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "for TLS use `ssh -L` here" in done.stderr
+
+
 @contextmanager
 def relay(folder: Path, port: int) -> Iterator[str]:
     """Run a relay; gives its address once it has connected to the master."""

@@ -186,8 +186,8 @@ def evaluate(mission: Mission, stations: int, kind: str | None, outage_s: float)
     rows = (mission.time_s > first_s) & (mission.time_s < last_s)
     if outage_s:
         # From the middle of each minute on.
-        observations = observations.select(~_missing(observations.time_s, outage_s))
-        rows &= _missing(mission.time_s, outage_s)
+        observations = observations.select(~missing(observations.time_s, outage_s))
+        rows &= missing(mission.time_s, outage_s)
     started_s = time.process_time()
     trajectory = fitted(mission, observations, kind)
     fitted_s = time.process_time()
@@ -208,10 +208,11 @@ def evaluate(mission: Mission, stations: int, kind: str | None, outage_s: float)
     return np.array([*squares, nees, (fitted_s - started_s) * cpu_s, (ended_s - fitted_s) * cpu_s])
 
 
-def _missing(time_s: FloatArray, outage_s: float) -> NDArray[np.bool_]:
-    phase_s = np.mod(time_s, OUTAGE_PERIOD_S) - 0.5 * OUTAGE_PERIOD_S
-    missing: NDArray[np.bool_] = (phase_s > 0) & (phase_s < outage_s)
-    return missing
+def missing(time_s: FloatArray, outage_s: float, period_s: float = OUTAGE_PERIOD_S) -> NDArray[np.bool_]:
+    """Whether measurements at times are missing."""
+    phase_s = np.mod(time_s, period_s) - 0.5 * period_s
+    found: NDArray[np.bool_] = (phase_s > 0) & (phase_s < outage_s)
+    return found
 
 
 def row(name: str, found: FloatArray) -> str:
@@ -224,10 +225,10 @@ def row(name: str, found: FloatArray) -> str:
     )
 
 
-def main() -> None:
-    """Print the table of each mission, and that of all."""
+def mission_parser(description: str | None, variants: int) -> argparse.ArgumentParser:
+    """Return the parser of what a table of missions needs; of this one and of imu_live."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--model", choices=["industrial", "consumer"], default="industrial")
     parser.add_argument("--scenario", default="dynamic")
@@ -235,11 +236,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=12)
     parser.add_argument("--duration", type=float, default=600.0)
     parser.add_argument("--outage", type=float, default=0.0)
-    parser.add_argument("--variants", type=int, default=len(VARIANTS))
+    parser.add_argument("--variants", type=int, default=variants)
     parser.add_argument("--odometry", action="store_true")
     parser.add_argument("--spin", action="store_true")
     parser.add_argument("--missions", type=Path)
-    arguments = parser.parse_args()
+    return parser
+
+
+def main() -> None:
+    """Print the table of each mission, and that of all."""
+    arguments = mission_parser(__doc__, len(VARIANTS)).parse_args()
     configure_logging("critical")
     head = (
         f"{'':<24} {'origin':>8} {'centroid':>8} {'p95':>8} {'rotation':>8} {'NEES':>8} "

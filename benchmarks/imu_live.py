@@ -15,14 +15,13 @@ in lines of so many, 3 ms after the last one of a line, instead of as recorded. 
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from imu import NEES_LIMIT, Mission, simulated
+from imu import NEES_LIMIT, Mission, missing, mission_parser, simulated
 
 from tsgt.geometry import log_so3
 from tsgt.geometry.inertial import InertialFixedLagSmoother
@@ -30,6 +29,8 @@ from tsgt.log import configure_logging
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
+    import argparse
+
     from numpy.typing import NDArray
 
     from tsgt.geometry import FloatArray
@@ -59,19 +60,16 @@ class Live(NamedTuple):
     predict_s: FloatArray
 
 
-def missing(time_s: FloatArray, outage_s: float) -> NDArray[np.bool_]:
+def outages(time_s: FloatArray, outage_s: float) -> NDArray[np.bool_]:
     """Whether measurements at times are missing."""
-    period_s = 20.0 if outage_s <= 3.0 else 60.0
-    phase_s = np.mod(time_s, period_s) - 0.5 * period_s
-    found: NDArray[np.bool_] = (phase_s > 0) & (phase_s < outage_s)
-    return found
+    return missing(time_s, outage_s, 20.0) if outage_s <= 3.0 else missing(time_s, outage_s)
 
 
 def run(mission: Mission, stations: int, arguments: argparse.Namespace, *, gyro_only: bool) -> Live:
     """Replay a mission."""
     rows = mission.observations.station < stations
     if arguments.outage:
-        rows &= ~missing(mission.observations.time_s, arguments.outage)
+        rows &= ~outages(mission.observations.time_s, arguments.outage)
     order = np.flatnonzero(rows)[np.argsort(mission.arrival_s[rows], kind="stable")]
     observations, arrival_s = mission.observations.select(order), mission.arrival_s[order]
     samples, sampled_s = mission.samples, mission.line_arrival_s
@@ -106,7 +104,7 @@ def run(mission: Mission, stations: int, arguments: argparse.Namespace, *, gyro_
         has_pose = window.converged and not window.ambiguous
         if has_pose:
             first_s = min(first_s, now_s)
-        wanted = missing(now_s, arguments.outage) if arguments.outage else number % PREDICT_EACH == 0
+        wanted = outages(now_s, arguments.outage) if arguments.outage else number % PREDICT_EACH == 0
         if now_s < first_s + START_S or not wanted:
             continue
         available.append(has_pose)
@@ -147,20 +145,8 @@ def line(name: str, found: Live) -> str:
 
 def main() -> None:
     """Print the table of each mission, and that of all."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--model", choices=["industrial", "consumer"], default="industrial")
-    parser.add_argument("--scenario", default="dynamic")
-    parser.add_argument("--seeds", type=int, default=4)
-    parser.add_argument("--first", type=int, default=12)
-    parser.add_argument("--duration", type=float, default=600.0)
-    parser.add_argument("--outage", type=float, default=0.0)
+    parser = mission_parser(__doc__, len(VARIANTS))
     parser.add_argument("--line", type=int, default=0)
-    parser.add_argument("--variants", type=int, default=len(VARIANTS))
-    parser.add_argument("--odometry", action="store_true")
-    parser.add_argument("--spin", action="store_true")
-    parser.add_argument("--missions", type=Path)
     arguments = parser.parse_args()
     configure_logging("critical")
     head = "\n".join(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeVar
 
 from pydantic import Field
 
@@ -15,7 +15,10 @@ from tsgt.model import MAX_INSTANT_NS, Vector3
 from tsgt.recording import Typed, decode
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
+
+Line = TypeVar("Line")
+Device = Literal["imu", "odometry"]
 
 FORMAT_VERSION = 1  # changes when a master of the old version would misunderstand the new one
 
@@ -36,8 +39,8 @@ Limit = Annotated[float, Field(gt=0, le=1e6)] | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HelloLine:
-    """The program's first line: version of the format, identity of the device, rate of its samples.
+class DeviceHello:
+    """First line of a program that reads a device: identity of the device, rate of its samples.
 
     Attributes
     ----------
@@ -45,20 +48,30 @@ class HelloLine:
         Nominal rate of the samples.
     clock
         Name of the device's clock or counter, for people.
-    angular_rate_limit_radps, specific_force_limit_mps2
-        Full scale of each axis; null where unknown.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["hello"] = "hello"
-    imu: int
     make: str
     model: str = ""
     serial_number: str = ""
     firmware: str = ""
     rate_hz: Annotated[float, Field(ge=_MIN_RATE_HZ, le=_MAX_RATE_HZ)]
     clock: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HelloLine(DeviceHello):
+    """That of an IMU; ``imu`` is the version of the format.
+
+    Attributes
+    ----------
+    angular_rate_limit_radps, specific_force_limit_mps2
+        Full scale of each axis; null where unknown.
+    """
+
+    imu: int
     angular_rate_limit_radps: Limit = None
     specific_force_limit_mps2: Limit = None
 
@@ -125,27 +138,36 @@ ProgramLine = HelloLine | SamplesLine | StatusLine
 _KINDS: dict[str, type[ProgramLine]] = {"hello": HelloLine, "samples": SamplesLine, "status": StatusLine}
 
 
-@dataclass(frozen=True, slots=True)
-class _Versioned:
-    imu: int
-
-
 class FormatVersionError(ValueError):
     """The program uses another version of the format: none of its lines can be used."""
 
 
-def decode_program_line(data: bytes) -> ProgramLine | None:
-    """Decode a line of a program; None for an unknown type.
+@dataclass(frozen=True, slots=True)
+class _Versioned:
+    imu: int | None = None
+    odometry: int | None = None
+
+
+def decode_device_line(
+    data: bytes, kinds: Mapping[str, type[Line]], device: Device, version: int
+) -> Line | None:
+    """Decode a line of a program that reads a device; None for an unknown type.
 
     Raises FormatVersionError for the ``hello`` of another version, and ValueError (one line) if it is not JSON or a field
     is missing or invalid.
     """
     kind = decode(Typed, data).type
-    if kind == "hello" and (version := decode(_Versioned, data).imu) != FORMAT_VERSION:
+    if kind == "hello" and (found := getattr(decode(_Versioned, data), device)) not in (None, version):
+        name = {"imu": "an IMU", "odometry": "odometry"}[device]
         raise FormatVersionError(
-            f"uses version {version} of the lines of an IMU, and this master version {FORMAT_VERSION}"
+            f"uses version {found} of the lines of {name}, and this master version {version}"
         )
-    return decode(_KINDS[kind], data) if kind in _KINDS else None
+    return decode(kinds[kind], data) if kind in kinds else None
+
+
+def decode_program_line(data: bytes) -> ProgramLine | None:
+    """Decode a line of an IMU's program; see :func:`decode_device_line`."""
+    return decode_device_line(data, _KINDS, "imu", FORMAT_VERSION)
 
 
 def check_angular_rate(rates_radps: Sequence[Vector3]) -> None:

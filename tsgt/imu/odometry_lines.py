@@ -7,8 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from tsgt.imu.lines import MAX_SAMPLES_PER_LINE, Counts, FormatVersionError, StatusLine
-from tsgt.recording import Typed, decode
+from tsgt.imu.lines import MAX_SAMPLES_PER_LINE, Counts, DeviceHello, StatusLine, decode_device_line
 
 ODOMETRY_FORMAT_VERSION = 1  # changes when a master of the old version would misunderstand the new one
 
@@ -16,26 +15,22 @@ MAX_SPEED_MPS = 50.0  # no ground robot is faster: a larger number has another u
 
 MAX_YAW_RATE_RADPS = 20.0
 
-_MIN_RATE_HZ, _MAX_RATE_HZ = 1.0, 1_000.0
+MAX_RATE_HZ = 1_000.0
 
 Numbers = Annotated[tuple[float, ...], Field(max_length=MAX_SAMPLES_PER_LINE)] | None
 Flags = Annotated[tuple[bool, ...], Field(max_length=MAX_SAMPLES_PER_LINE)] | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryHelloLine:
-    """The program's first line: version of the format, identity of the device, rate of its samples."""
+class OdometryHelloLine(DeviceHello):
+    """The program's first line; ``odometry`` is the version of the format."""
 
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
-
-    type: Literal["hello"] = "hello"
     odometry: int
-    make: str
-    model: str = ""
-    serial_number: str = ""
-    firmware: str = ""
-    rate_hz: Annotated[float, Field(ge=_MIN_RATE_HZ, le=_MAX_RATE_HZ)]
-    clock: str = ""
+
+    def __post_init__(self) -> None:
+        """Reject a rate that no wheels have."""
+        if self.rate_hz > MAX_RATE_HZ:
+            raise ValueError(f"rate_hz is {self.rate_hz:g}, at most {MAX_RATE_HZ:g}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,23 +85,9 @@ _KINDS: dict[str, type[OdometryProgramLine]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Versioned:
-    odometry: int
-
-
 def decode_odometry_line(data: bytes) -> OdometryProgramLine | None:
-    """Decode a line of a program; None for an unknown type.
-
-    Raises FormatVersionError for the ``hello`` of another version, and ValueError (one line) if it is not JSON or a field
-    is missing or invalid.
-    """
-    kind = decode(Typed, data).type
-    if kind == "hello" and (version := decode(_Versioned, data).odometry) != ODOMETRY_FORMAT_VERSION:
-        raise FormatVersionError(
-            f"uses version {version} of the lines of odometry, and this master version {ODOMETRY_FORMAT_VERSION}"
-        )
-    return decode(_KINDS[kind], data) if kind in _KINDS else None
+    """Decode a line of an odometry program; see :func:`~tsgt.imu.lines.decode_device_line`."""
+    return decode_device_line(data, _KINDS, "odometry", ODOMETRY_FORMAT_VERSION)
 
 
 def check_speed(speed_mps: float) -> None:

@@ -50,7 +50,7 @@ FAULTS: list[tuple[dict[str, Any], str, str]] = [
             "pose": {"valid": False, "reason": "outage", "quality": "invalid"},
         },
         "NO POSE",
-        "silent for",
+        "no station is received",
     ),
     ({"free_bytes": 12_000_000}, "CARE", "the disk is full: 12 MB left"),
     ({"centre_m": (80.0, 80.0)}, "CARE", "outside the geofence site"),

@@ -166,17 +166,21 @@ def _unit_finding(reference: ReferencePoses, estimate: Estimate) -> InputFinding
             return InputFinding(
                 "error",
                 "unit",
-                f"the estimate moves {ratio:.3g} times as fast as the reference: its positions seem to be in {name}; convert "
+                f"the estimate moves {_factor(ratio)} times as fast as the reference: its positions seem to be in {name}; convert "
                 "them to metres, or fit the scale (--fit scale)",
             )
     if max(ratio, 1.0 / ratio) > _SCALE:
         return InputFinding(
             "warning",
             "scale",
-            f"the estimate moves {ratio:.3g} times as fast as the reference: if it has no scale (monocular), fit it "
+            f"the estimate moves {_factor(ratio)} times as fast as the reference: if it has no scale (monocular), fit it "
             "(--fit scale)",
         )
     return None
+
+
+def _factor(ratio: float) -> str:
+    return f"{ratio:.0f}" if ratio >= 10.0 else f"{ratio:.2g}"
 
 
 def _typical_step_m(stamp_ns: NDArray[np.int64], position_m: FloatArray) -> float:

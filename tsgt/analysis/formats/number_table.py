@@ -36,6 +36,8 @@ _NUMBER = re.compile(r"[-+]?(?:[0-9.]|nan|inf)", re.ASCII | re.IGNORECASE)
 
 # Unix times of 1973 to 5138 by unit: the same number cannot be one of another unit.
 _ABSOLUTE: tuple[tuple[float, TimeUnit], ...] = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+# Unix times of less than five years.
+_FROM_ZERO = 0.1
 # Steps between times from zero on: no estimate has a pose every 1000 s.
 _RELATIVE: tuple[tuple[float, TimeUnit], ...] = ((1.5e6, "ns"), (1e3, "us"))
 
@@ -180,17 +182,15 @@ def _slow_time_ns(table: NumberTable, row: int, cell: str, digits: int) -> int:
 def unit_of(values: FloatArray) -> TimeUnit:
     """Return the unit of times, (M,): Unix times by their size, times from zero on by the steps between them."""
     finite = values[np.isfinite(values)]
+    if not len(finite):
+        return "s"
     # Numbers of any size may stand here.
     with np.errstate(over="ignore"):
         steps = np.abs(np.diff(finite))
-    steps = steps[steps > 0]
-    for table, sizes in ((_ABSOLUTE, finite), (_RELATIVE, steps)):
-        if len(sizes):
-            typical = float(np.quantile(sizes, 0.5, method="lower"))
-            for least, unit in table:
-                if typical >= least:
-                    return unit
-    return "s"
+        from_zero = np.ptp(finite) > _FROM_ZERO * np.abs(finite).min()
+    table, sizes = (_RELATIVE, steps[steps > 0]) if from_zero else (_ABSOLUTE, finite)
+    typical = float(np.quantile(sizes, 0.5, method="lower"))
+    return next((unit for least, unit in table if typical >= least), "s")
 
 
 def joined_times_ns(table: NumberTable, seconds: int, nanoseconds: int) -> NDArray[np.int64]:

@@ -47,12 +47,11 @@ def reference_of_poses(batch: PoseBatch) -> ReferencePoses:
     )
 
 
-def read_reference_poses(path: Path, point: ReferencePoint | None = None) -> ReferencePoses:
+def read_reference_poses(path: Path) -> ReferencePoses:
     """Read reference poses from a recording that has them (its final ones), a TUM file or a CSV file.
 
-    ``point``: of the poses, unless the file states it; that of a TUM or CSV file without a statement is the robot's origin. A CSV
-    file has the diagonal of the covariance alone, a TUM file none. Raises InputFileError, and RecordingError or CorruptLineError
-    for a recording.
+    A TUM file states their point in a comment, a CSV file must be of the robot's origin. A CSV file has the diagonal of the covariance
+    alone, a TUM file none. Raises InputFileError, and RecordingError or CorruptLineError for a recording.
     """
     if is_recording(path):
         return _recorded(path)
@@ -60,16 +59,9 @@ def read_reference_poses(path: Path, point: ReferencePoint | None = None) -> Ref
     if table.header_line is None and len(table.columns) == _TUM_COLUMNS:
         reference = read_tum(path)
         T = transform_from(rotation_from_quaternion(reference.orientation_xyzw), reference.position_m)
-        stated = reference.reference_point
-        return ReferencePoses(
-            reference.stamp_ns,
-            T,
-            None,
-            None,
-            np.ones(len(T), dtype=np.bool_),
-            point if point is not None and stated == ROBOT_ORIGIN else stated,
-        )
-    return _table(table, point)
+        valid = np.ones(len(T), dtype=np.bool_)
+        return ReferencePoses(reference.stamp_ns, T, None, None, valid, reference.reference_point)
+    return _table(table)
 
 
 def is_recording(path: Path) -> bool:
@@ -116,7 +108,7 @@ def _recorded(path: Path) -> ReferencePoses:
     )
 
 
-def _table(table: NumberTable, point: ReferencePoint | None) -> ReferencePoses:
+def _table(table: NumberTable) -> ReferencePoses:
     path = table.path
     raw, valid = raw_and_valid(table, None)
     if raw.orientation_xyzw is None:
@@ -124,17 +116,18 @@ def _table(table: NumberTable, point: ReferencePoint | None) -> ReferencePoses:
     kept = ordered(raw.select(valid), path)
     if kept.notes != raw.notes:
         raise InputFileError(f"cannot be the reference: {'; '.join(kept.notes)}", path=path)
-    if point is None:
-        point = ROBOT_ORIGIN
-        names = table.names or []
-        if "child_frame" in names:
-            other = set(table.columns[names.index("child_frame")]) - {ROBOT_FRAME}
-            if other:
-                raise InputFileError(
-                    f"has poses of {', '.join(sorted(other))}, but not where that is on the robot; give --point",
-                    path=path,
-                )
-    return _reference(raw.stamp_ns, raw.position_m, raw.orientation_xyzw, raw.covariance, None, valid, point)
+    names = table.names or []
+    if "child_frame" in names:
+        other = set(table.columns[names.index("child_frame")]) - {ROBOT_FRAME}
+        if other:
+            raise InputFileError(
+                f"has poses of {', '.join(sorted(other))}, but not where that is on the robot; use TUM or JSON lines, which "
+                "state it",
+                path=path,
+            )
+    return _reference(
+        raw.stamp_ns, raw.position_m, raw.orientation_xyzw, raw.covariance, None, valid, ROBOT_ORIGIN
+    )
 
 
 def _reference(

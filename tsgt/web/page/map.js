@@ -50,6 +50,7 @@ export class MissionMap {
 
   zoom(ratio) {
     this.scale = Math.min(Math.max(this.scale * ratio, MIN_SCALE), MAX_SCALE);
+    this.fitted = true;
     this.draw();
   }
 
@@ -76,7 +77,7 @@ export class MissionMap {
     const tall = this.north ? high[0] - low[0] : Math.hypot(high[0] - low[0], high[1] - low[1]);
     const wide = this.north ? high[1] - low[1] : tall;
     this.scale = Math.min(Math.max(Math.min(width / Math.max(wide, 4), height / Math.max(tall, 4)), MIN_SCALE), MAX_SCALE);
-    this.fitted = true;
+    this.fitted = !this.follow || Boolean(this.last); // again with the first valid pose
     this.draw();
   }
 
@@ -168,7 +169,9 @@ export class MissionMap {
     for (const fence of this.setup.fences) {
       this.line(pen, fence.polygon, true);
       const [x, y] = this.at(fence.polygon[0]);
-      pen.fillText(`${fence.name}: stay ${fence.allowed_side}`, x + 6, y - 6);
+      const text = `${fence.name}: stay ${fence.allowed_side}`, wide = this.canvas.clientWidth;
+      const rightmost = wide - 60 - pen.measureText(text).width; // left of the compass
+      pen.fillText(text, x < wide ? Math.min(x + 6, rightmost) : x + 6, y - 6);
     }
     pen.setLineDash([]);
   }

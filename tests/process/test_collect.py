@@ -194,11 +194,16 @@ def test_keys_are_read_from_stdin(folder: Path) -> None:
     """The end of the input ends the command, which reports missing measurements."""
     path = folder / "targets.csv"
     command = collect_command(folder, path)
-    done = subprocess.run(
-        [sys.executable, *command, "--target-count", "3"],
-        env=ENVIRONMENT, input=b"\ns\n", capture_output=True, timeout=2 * TIMEOUT_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    for _ in range(
+        5
+    ):  # the radio of a busy machine may be too late for all tries of a command; the next run continues
+        done = subprocess.run(
+            [sys.executable, *command, "--target-count", "3"],
+            env=ENVIRONMENT, input=b"\ns\n", capture_output=True, timeout=2 * TIMEOUT_S, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        if b"3 measurements are missing" not in done.stderr:
+            break
     assert b"2 measurements are missing" in done.stderr
     wait_for_mode(folder, "tracking")
     check = ("-m", "tsgt", "calibrate", "check", "--config", str(folder / "master.toml"), "--json")

@@ -312,7 +312,7 @@ class MissionState:
             *findings.odometry_findings(self._status),
         ]
         waiting_for = radio_failure or findings.waiting_for(conditions)
-        return judge(stream, facts, waiting_for, _without_repetition(others))
+        return judge(stream, facts, waiting_for, others)
 
     def _conditions(self, now_s: float) -> dict[int, stations.Condition]:
         if self._status is None:
@@ -404,9 +404,3 @@ class MissionState:
 def plain(text: str) -> str:
     """Return text from outside in one line of bounded length, without control characters."""
     return "".join(sign if sign.isprintable() else " " for sign in text[:MAX_TEXT])
-
-
-def _without_repetition(items: list[Finding]) -> list[Finding]:
-    """Return the findings without those whose text another one has, or begins with."""
-    once = list({each.cause: each for each in reversed(items)}.values())[::-1]
-    return [each for each in once if not any(o.cause.startswith(each.cause) for o in once if o is not each)]

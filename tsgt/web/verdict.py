@@ -114,9 +114,15 @@ def judge(
     findings = stream_findings(stream)
     if findings:
         return findings
-    findings = [*pose_findings(pose, waiting_for), *others]
+    findings = [*pose_findings(pose, waiting_for), *_without_repetition(others)]
     findings.sort(key=lambda finding: (-finding.level, not finding.urgent))
     return findings or [GOOD]
+
+
+def _without_repetition(items: Sequence[Finding]) -> list[Finding]:
+    """Return the findings without those whose text another one has, or begins with."""
+    once = list({each.cause: each for each in reversed(items)}.values())[::-1]
+    return [each for each in once if not any(o.cause.startswith(each.cause) for o in once if o is not each)]
 
 
 class Hold:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import runpy
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from tsgt.geometry import invert, quaternion_from_rotation, transform_from
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from harness.cli import Tsgt
+
+EXAMPLE = Path(__file__).parents[4] / "examples" / "compare_estimates.py"
 
 START_S = 1_780_000_000
 RATE_HZ = 10.0
@@ -163,6 +166,19 @@ def test_report_is_a_page_with_figures(tsgt: Tsgt, reference: Path, lidar: Path,
     assert json.loads((folder / "report.json").read_text(encoding="utf-8")) == found
     names = {"map", "error_map", "errors_over_time", "components_1", "fit", "drift", "by_motion"}
     assert {path.stem for path in folder.glob("*.pdf")} == names
+
+
+def test_example_for_a_notebook_runs(
+    reference: Path, lidar: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It finds what the command finds."""
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), str(reference), str(lidar)])
+    runpy.run_path(str(EXAMPLE))
+    first, place, ate, worst = capsys.readouterr().out.splitlines()
+    assert float(first.split()[2]) == pytest.approx(1e3 * OFFSET_S, abs=1.0)
+    assert "sensor at [0.3" in place
+    assert 5.0 < float(ate.split()[1]) < 15.0
+    assert worst.startswith("  worst ")
 
 
 @pytest.mark.parametrize(("arguments", "said"), [

@@ -63,12 +63,15 @@ def test_accuracy(stations: int, prior: MotionPrior | None, limit_mm: float, lim
 
 
 @pytest.mark.slow
-def test_segments_give_the_result_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Measurements outside the overlap carry next to no information."""
-    whole = fit(2)
+@pytest.mark.parametrize(("stations", "overlap_s"), [(2, 12.0), (1, 2.0)])
+def test_segments_give_the_result_of_the_whole(
+    stations: int, overlap_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Measurements outside the overlap carry next to no information; one prism needs all for its heading."""
+    whole = fit(stations)
     monkeypatch.setattr(smoother, "SEGMENT_S", 18.0)
-    monkeypatch.setattr(smoother, "OVERLAP_S", 12.0)
-    parts = fit(2)
+    monkeypatch.setattr(smoother, "OVERLAP_S", overlap_s)
+    parts = fit(stations)
     time_s = np.arange(2.0, 48.0, 0.3)
     (expected, covariance), (found, _) = whole.trajectory.at(time_s), parts.trajectory.at(time_s)
     sigma_m = np.sqrt(np.einsum("nii->ni", covariance)[:, :3])

@@ -11,6 +11,7 @@ from harness.records import POSE, STATUS, measurement, recording_bytes
 
 from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import read_pos, read_stationary_intervals, read_target_file
+from tsgt.analysis.formats.trajectories import read_estimates
 from tsgt.config import load_any
 from tsgt.errors import ConfigError, InputFileError, RecordingError
 from tsgt.recording import MAX_LINE_BYTES, load_recording
@@ -46,6 +47,11 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[int], bytes]]] = {
     "nested": (load_recording, lambda count: recording_bytes() + b"[" * 500 * count + b"\n"),
     "receiver": (read_pos, _pos),
     "trajectory": (read_tum, lambda count: b"".join(b"%d.5 1 2 3 0 0 0 1\n" % k for k in range(10 * count))),
+    "estimate": (
+        read_estimates,
+        lambda count: b"".join(b"%d.5,1,2,3,0,0,%d,1\n" % (k, k % 2) for k in range(10 * count)),
+    ),
+    "names": (read_estimates, lambda count: b"x." * 100 * count + b",y" * 20 * count + b"\n1\n"),
     "odometry": (
         read_stationary_intervals,
         lambda count: b"".join(b"%d,0,0\n" % k for k in range(10 * count)),

@@ -59,7 +59,7 @@ def tables(draw: st.DrawFn) -> str:
 
 
 @given(tables() | st.binary(max_size=80))
-@settings(max_examples=60)
+@settings(max_examples=40)
 def test_any_text_is_an_estimate_or_an_error(content: str | bytes) -> None:
     """TUM, KITTI, EuRoC and CSV are told by the content."""
     with tempfile.TemporaryDirectory() as folder:
@@ -86,7 +86,7 @@ with tempfile.TemporaryDirectory() as _folder:
 
 
 @given(st.sampled_from(sorted(BAGS)), st.data())
-@settings(max_examples=25)
+@settings(max_examples=15)
 def test_damaged_bag_is_an_estimate_or_an_error(suffix: str, data: st.DataObject) -> None:
     """Changed bytes, and a file that was cut off."""
     content = bytearray(BAGS[suffix])

@@ -55,21 +55,22 @@ def test_true_relation_takes_an_exact_estimate_to_the_truth() -> None:
     assert found.ate_rotation_rad("yaw") == pytest.approx(0.0, abs=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("model", "low_percent", "high_percent"), [(LIDAR, 0.1, 0.5), (VISUAL_INERTIAL, 0.2, 0.8)]
-)
-def test_drift_is_typical(model: EstimateModel, low_percent: float, high_percent: float) -> None:
-    """Translation error over segments of 100 m, as KITTI defines it, in per cent; the path is curved, which drift of the yaw forgives."""
-    percent = []
-    for seed in range(6):
-        found = _simulated(model, seed)
+@pytest.mark.parametrize(("model", "percent"), [(LIDAR, 0.55), (VISUAL_INERTIAL, 1.15)])
+def test_drift_is_that_of_published_methods(model: EstimateModel, percent: float) -> None:
+    """Position error after 400 m straight ahead at 2 m/s, relative to the pose at the start, as KITTI defines it."""
+
+    def straight(time_s: np.ndarray) -> np.ndarray:
+        return transform_from(np.eye(3), np.column_stack([2.0 * time_s, 0.0 * time_s, 0.0 * time_s]))
+
+    slow = replace(model, rate_hz=1.0, dropouts_per_min=0.0)
+    errors_m = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        found = simulate_estimate(slow, draw_relation(slow, rng), straight, 202.0, rng)
         true, estimated = found.T_station1_sensor, found.T_station1_estimated
-        driven_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))]
-        starts = np.flatnonzero(driven_m + 100.0 < driven_m[-1])[::50]
-        ends = np.searchsorted(driven_m, driven_m[starts] + 100.0)
-        error = invert(invert(true[starts]) @ true[ends]) @ (invert(estimated[starts]) @ estimated[ends])
-        percent.append(np.linalg.norm(error[:, :3, 3], axis=1).mean())
-    assert low_percent < np.mean(percent) < high_percent
+        error = invert(invert(true[0]) @ true[200]) @ (invert(estimated[0]) @ estimated[200])
+        errors_m.append(np.linalg.norm(error[:3, 3]))
+    assert 100.0 * np.mean(errors_m) / 400.0 == pytest.approx(percent, rel=0.25)
 
 
 def test_gravity_keeps_the_tilt() -> None:
@@ -92,7 +93,7 @@ def test_visual_inertial_has_jitter_and_dropouts() -> None:
 
 def test_gnss_errors() -> None:
     """Positions alone; errors of 10 mm horizontal and 20 mm vertical that last for a minute."""
-    errors = np.concatenate([_errors_m(_simulated(GNSS, seed)) for seed in range(40)])
+    errors = np.concatenate([_errors_m(_simulated(GNSS, seed)) for seed in range(25)])
     np.testing.assert_allclose(errors.std(axis=0), [0.0104, 0.0104, 0.0202], rtol=0.15)
     found = _simulated(GNSS)
     assert found.orientation_xyzw is None

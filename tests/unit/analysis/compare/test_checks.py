@@ -55,7 +55,7 @@ def _codes(estimate: Estimate, **options: Any) -> list[tuple[str, str]]:
 @pytest.mark.parametrize("model", [LIDAR, VISUAL_INERTIAL, GNSS])
 def test_good_estimates_are_not_blamed(model: EstimateModel) -> None:
     """Of any kind; not even with an offset of 2 s, and after divergence."""
-    for seed in range(3):
+    for seed in range(2):
         estimate = _estimate(replace(model, diverges_at_s=170.0), seed)
         late = replace(estimate, stamp_ns=estimate.stamp_ns + 2_000_000_000)
         assert _codes(estimate) == _codes(late) == []
@@ -133,7 +133,7 @@ def test_missing_scale_is_a_warning() -> None:
 @pytest.mark.parametrize(("written", "order"), [([3, 0, 1, 2], "w first"), ([1, 2, 3, 0], "w last")])
 def test_wrong_order_of_quaternions_is_an_error(model: EstimateModel, written: list[int], order: str) -> None:
     """Whatever the sensor's and the frame's axes are; with an offset of 0.5 s left."""
-    for seed in range(5):
+    for seed in range(2):
         estimate = _estimate(model, seed)
         assert estimate.orientation_xyzw is not None
         wrong = replace(estimate, orientation_xyzw=estimate.orientation_xyzw[:, written])

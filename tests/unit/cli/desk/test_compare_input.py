@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from harness.paired import drive
-from harness.pose_files import seconds
+from harness.pose_files import (
+    Poses,
+    pose_stamped,
+    seconds,
+    write_bag,
+    write_euroc,
+    write_kitti,
+    write_tum,
+)
+from rosbags.rosbag2 import StoragePlugin
 
 from tsgt.geometry import quaternion_from_rotation
 
@@ -81,3 +90,30 @@ def test_repairs_are_told(tsgt: Tsgt, tmp_path: Path) -> None:
         "only 20 s of overlap: the estimate lasts 20 s, the reference 60 s",
     ):
         assert said in outcome.err + outcome.out
+
+
+@pytest.mark.slow
+def test_all_formats_give_the_same_errors(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The same poses as TUM, EuRoC, KITTI and bags of both kinds, against a TUM file of slightly other ones."""
+    reference = write(tmp_path / "reference.tum")
+    poses = Poses(300)
+    poses.stamp_ns = START_NS + np.arange(300) * 100_000_000 + 12_345_678
+    poses.position_m = TRUE[:300, :3, 3] + 0.01
+    poses.orientation_xyzw = quaternion_from_rotation(TRUE[:300, :3, :3])
+    messages = [(t, pose_stamped(t, p, q)) for t, p, q in poses.rows()]
+    files = [
+        write_tum(tmp_path / "tum.txt", poses),
+        write_euroc(tmp_path / "euroc.csv", poses),
+        write_kitti(tmp_path / "kitti.txt", poses, tmp_path / "kitti_times.txt"),
+        *(write_bag(tmp_path / each.name, {"/pose": messages}, plugin=each) for each in StoragePlugin),
+    ]
+    outcome = tsgt("compare", reference, *files, "--fit", "none", "--align", "none", "--json")
+    found = outcome.json()["estimates"]
+    assert set(found) == {"tum", "euroc", "kitti", "MCAP", "SQLITE3"}
+    first = found["tum"]["ate"]
+    assert first["n"] == 300
+    assert 10.0 < first["position_rms_mm"] < 50.0
+    for each in found.values():
+        assert each["ate"]["n"] == 300
+        for key in ("position_rms_mm", "orientation_rms_deg"):
+            assert each["ate"][key] == pytest.approx(first[key], rel=1e-9)

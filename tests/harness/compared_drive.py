@@ -17,8 +17,11 @@ START_NS = 1_700_000_000_000_000_000
 def robot(time_s: FloatArray) -> FloatArray:
     """Return ``T_station1_robot`` of a robot that drives curves with changing speed, and rocks: (N, 4, 4)."""
     t = time_s
-    position = np.stack([8 * np.sin(0.2 * t), 6 * np.cos(0.31 * t), 0.02 * np.sin(1.8 * t)], axis=1)
-    angles = np.stack([0.03 * np.sin(2.0 * t), 0.03 * np.cos(1.7 * t), 1.3 * np.sin(0.3 * t)], axis=1)
+    heading = 1.3 * np.sin(0.3 * t) + 0.6 * np.sin(0.47 * t + 0.004 * t * t)
+    position = np.stack(
+        [8 * np.sin(0.2 * t), 6 * np.cos(0.31 * t + 0.0015 * t * t), 0.02 * np.sin(1.8 * t)], axis=1
+    )
+    angles = np.stack([0.03 * np.sin(2.0 * t), 0.03 * np.cos(1.7 * t), heading], axis=1)
     return transform_from(Rotation.from_euler("xyz", angles).as_matrix(), position)
 
 
@@ -47,3 +50,8 @@ def estimate_at(time_s: FloatArray, **changes: object) -> Estimate:
         covariance=None,
     )
     return dataclasses.replace(found, **changes)  # type: ignore[arg-type]
+
+
+def long_reference() -> ReferencePoses:
+    """Return two minutes; the drive does not repeat itself within them."""
+    return reference(120.0)

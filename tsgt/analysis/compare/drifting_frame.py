@@ -39,6 +39,7 @@ NAMES = (
 """Unknowns besides the drifting frame, in their order."""
 
 KNOT_STEP_S = 0.5
+MIN_ROWS, MIN_SPAN_S = 5, 2.0
 ROBUSTNESS_DOF = 5.0
 """Degrees of freedom of Student's t-distribution that weighs residuals: 3 % less efficient than least squares if all is normal."""
 
@@ -128,15 +129,17 @@ class Solved:
 
 
 def rows_of(estimate: Estimate, usable: NDArray[np.bool_], min_step_s: float) -> Rows:
-    """Choose rows at least about ``min_step_s`` apart among the usable ones; at least two knots, or ValueError."""
+    """Choose rows at least about ``min_step_s`` apart among the usable ones. Raises ValueError: they last too short."""
     row = np.flatnonzero(usable)
     since_s = (estimate.stamp_ns - estimate.stamp_ns[0]) / 1e9
+    if len(row) < MIN_ROWS or since_s[row[-1]] - since_s[row[0]] < MIN_SPAN_S:
+        raise ValueError(
+            f"a fit needs at least {MIN_ROWS} poses over {MIN_SPAN_S:g} s inside the reference, there are {len(row)}"
+        )
     row = row[_first_of_each(np.floor(since_s[row] / min_step_s))]
     knot = _first_of_each(np.floor(since_s[row] / KNOT_STEP_S))
     if len(row) - 1 - knot[-1] > 0:
         knot = np.append(knot, len(row) - 1)
-    if len(knot) < 2:
-        raise ValueError("an estimate needs poses over at least half a second of the reference")
     rotation = _rotations(estimate, row)
     interval, share = _in_interval(since_s[row[knot]], since_s[row])
     return Rows(
@@ -230,8 +233,14 @@ def linearise(
     return Linearised(motion.known, arm_m, pose, by_state, by_border, walk, walk_by_state, walk_by_border)
 
 
-def robust_weight(square: FloatArray, dimensions: int) -> FloatArray:
-    """Weight by Student's t-distribution of residuals with this squared Mahalanobis distance."""
+def robust_weight(square: FloatArray, dimensions: int, *, convex: bool) -> FloatArray:
+    """Weight of residuals with this squared Mahalanobis distance: by Student's t-distribution, or Huber's while ``convex``.
+
+    Huber's cost has one minimum only: from far away, Student's would take for outliers whatever does not fit yet.
+    """
+    if convex:
+        limit = dimensions + 4.0
+        return np.asarray(np.sqrt(limit / np.maximum(square, limit)))
     return (ROBUSTNESS_DOF + dimensions) / (ROBUSTNESS_DOF + square)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy import stats
 
 from tsgt.analysis.compare.drifting_frame import (
     NAMES,
@@ -48,6 +49,9 @@ MAX_ROWS = 15_000
 
 NOISE_PASSES = 3
 MAX_ITERATIONS = 20
+CONVEX_ITERATIONS = 4
+LOST_KNOTS, LOST_RATIO = 8, 6.0
+LOST_AT_FIRST = 1e12
 CONVERGED_SIGMAS = 1e-3
 
 OBSERVABLE_SIGMA = dict(zip(NAMES, [0.05, 1e-3, 0.1, *[0.05] * 3, *[math.radians(1.0)] * 3], strict=True))
@@ -57,6 +61,11 @@ WEAK_AGAINST_PRIOR = 2.0  # Sigma of the motion to that of the prior, above whic
 
 OUTLIER_SQUARE = 40.0  # Squared Mahalanobis distance of three components
 LOST_SQUARE = 60.0  # Of a step of drift
+MAX_LOST_SHARE = 0.6
+IN_BAND = 1.5
+"""Power of errors of the reference relative to white noise of their correlation time: a first-order Gauss-Markov process has 2 at
+rest, and 1 at the 0.3 Hz at which robots rock."""
+
 CORRELATION_S = 15.0
 """Time over which errors may be correlated beyond the drift that is modelled."""
 
@@ -102,7 +111,7 @@ def fit(
     """Fit the parts asked for; of the others, and of what the motion does not determine, ``start`` holds.
 
     Clock and extrinsic are always fitted together, so that an extrinsic which is not asked for, hence not applied, does not
-    bias the offset. Raises ValueError: less than a second of the estimate overlaps the reference.
+    bias the offset. Raises ValueError: less than two seconds of the estimate lie inside the reference.
     """
     start = initial_relation() if start is None else start
     trajectory = ReferenceTrajectory(reference)
@@ -158,18 +167,23 @@ def _fit_jointly(
     unknowns = start_states(trajectory, rows, begun, frame)
     active = [i for i, name in enumerate(NAMES) if _is_free(name, settings, rows)]
     prior_terms = _prior_terms(settings, active)
-    noise = estimate_noise(trajectory, rows, unknowns)
+    lost = _moves_otherwise(rows, unknowns)
+    noise = estimate_noise(trajectory, rows, unknowns, lost, is_rough=True)
+    first: NDArray[np.bool_] | None = lost
     solved: Solved | None = None
     for _ in range(NOISE_PASSES):
-        unknowns, solved = _iterate(trajectory, rows, unknowns, noise, active, T_prior, prior_terms)
-        noise = estimate_noise(trajectory, rows, unknowns)
+        unknowns, solved = _iterate(trajectory, rows, unknowns, noise, active, T_prior, prior_terms, first)
+        lost, first = _steps_lost(trajectory, rows, unknowns, noise), None
+        noise = estimate_noise(trajectory, rows, unknowns, lost)
     unobservable = [i for i, name in enumerate(NAMES) if _never_observable(name, settings, rows)]
     weak = _weak(solved, active, prior_terms) if solved is not None else []
     if weak:
         unobservable += weak
         active = [i for i in active if i not in weak]
         unknowns = _at_prior(unknowns, weak, begun, T_prior)
-    unknowns, solved = _iterate(trajectory, rows, unknowns, noise, active, T_prior, prior_terms)
+    unknowns, solved = _iterate(
+        trajectory, rows, unknowns, noise, active, T_prior, prior_terms, tolerance_sigmas=CONVERGED_SIGMAS
+    )
     covariance = _covariance(solved, rows)
     return _Joint(
         trajectory, rows, unknowns, noise, active, covariance, tuple(NAMES[i] for i in sorted(unobservable))
@@ -245,22 +259,33 @@ def _iterate(
     active: list[int],
     T_prior: FloatArray,
     prior_weight: FloatArray,
+    lost: NDArray[np.bool_] | None = None,
+    tolerance_sigmas: float = 0.05,
 ) -> tuple[Unknowns, Solved]:
-    """Iterate to convergence; returns the unknowns with the system at which they converged."""
+    """Iterate to convergence; returns the unknowns with the system at which they converged.
+
+    ``lost``: (K - 1,) steps of drift that must not count in the first step of a fit from initial values.
+    """
     dimensions = 3 if rows.rotation is None else 6
     covariance = _in_band(
         own_covariance(trajectory, _stamp_ns(rows, unknowns), _known(trajectory, rows, unknowns)), rows
     )
     turn = None
-    for _ in range(MAX_ITERATIONS):
+    for iteration in range(MAX_ITERATIONS):
+        # The first step is that of least squares: from knots that follow every noisy pose to a smooth drift.
+        convex = lost is not None and iteration < CONVEX_ITERATIONS
         linear = linearise(trajectory, rows, unknowns, turn)
         whitening = whiten(
             linear.pose, noise.white, covariance, linear.arm_m, has_orientation=rows.rotation is not None
         )
         turn = whitening.turn
-        weight = np.where(linear.known, robust_weight(whitening.square, dimensions), 0.0)
         walk_variance = _walk_variance(rows, unknowns, noise)
-        walk_weight = robust_weight(_pairwise(linear.walk**2 / walk_variance), 3)
+        walk_square = _pairwise(linear.walk**2 / walk_variance)
+        if lost is not None and iteration == 0:
+            whitening = replace(whitening, square=np.zeros(len(whitening.square)))
+            walk_square = np.where(lost[:, None], LOST_AT_FIRST, np.zeros((1, 2)))
+        weight = np.where(linear.known, robust_weight(whitening.square, dimensions, convex=convex), 0.0)
+        walk_weight = robust_weight(walk_square, 3, convex=convex)
         difference = np.zeros(len(NAMES))
         difference[3:6] = unknowns.arm_m - T_prior[:3, 3]
         difference[6:] = log_so3(unknowns.R_point_sensor @ T_prior[:3, :3].T)
@@ -274,13 +299,34 @@ def _iterate(
         )
         unknowns = unknowns.moved(solved.border_step, solved.state_step)
         sigma = 1.0 / np.sqrt(np.maximum(np.diag(solved.information), 1e-30))
-        if (np.abs(solved.border_step[active]) <= CONVERGED_SIGMAS * sigma).all():
+        if not convex and (np.abs(solved.border_step[active]) <= tolerance_sigmas * sigma).all():
             break
     return unknowns, solved
 
 
+def _steps_lost(
+    trajectory: ReferenceTrajectory, rows: Rows, unknowns: Unknowns, noise: Noise
+) -> NDArray[np.bool_]:
+    """(K - 1,) steps of drift that no noise explains; none if they are most of all."""
+    linear = linearise(trajectory, rows, unknowns)
+    square = _pairwise(linear.walk**2 / _walk_variance(rows, unknowns, noise))
+    lost = np.max(square, axis=1) > LOST_SQUARE
+    return lost if lost.mean() < MAX_LOST_SHARE else np.zeros(len(lost), dtype=np.bool_)
+
+
+def _moves_otherwise(rows: Rows, unknowns: Unknowns) -> NDArray[np.bool_]:
+    """(K - 1,) whether the estimate moves over seconds unlike the reference by far more than it usually does."""
+    own = unknowns.scale * rows.position_m[rows.knot]
+    before = np.arange(len(own) - 1)
+    after = np.minimum(before + LOST_KNOTS, len(own) - 1)
+    step = own[after] - own[before]
+    by_start, by_end = (rotate(unknowns.Q[each], step) for each in (before, after))
+    square = ((0.5 * (by_start + by_end) - unknowns.c[after] + unknowns.c[before]) ** 2).sum(axis=1)
+    return np.asarray(square > LOST_RATIO**2 * max(float(np.median(square)), 1e-12))
+
+
 def _in_band(covariance: FloatArray | None, rows: Rows) -> FloatArray | None:
-    """Inflate a covariance of errors that are correlated from row to row to that of white ones with as much power in slow motion."""
+    """Inflate a covariance of errors correlated from row to row to that of white ones of equal power where robots move."""
     if covariance is None:
         return None
     return covariance * max(
@@ -367,9 +413,13 @@ def _covariance(solved: Solved, rows: Rows) -> FloatArray:
     sums = running[lags:] - running[:-lags]
     # Sums over every window of this length: Bartlett's weights. Fewer independent windows than unknowns say too little.
     meat = sums.T @ sums / lags
-    windows = max(n / lags, p + 1.0)
-    sandwich = model @ meat @ model * windows / (windows - p if windows - p > 1 else 1.0)
-    wider = np.sqrt(np.maximum(np.diag(sandwich) / np.maximum(np.diag(model), 1e-300), 1.0))
+    windows = n / lags
+    freedom = max(windows - p, 2.0)
+    sandwich = model @ meat @ model * max(windows / freedom, 1.0)
+    ratio = np.diag(sandwich) / np.maximum(np.diag(model), 1e-300)
+    # What few windows say of one unknown is uncertain itself: never less than the average of all, and as Student's t has it.
+    wider = np.sqrt(np.maximum(ratio, max(1.0, float(ratio.mean()))))
+    wider *= float(stats.t.ppf(stats.norm.cdf(2.0), freedom)) / 2.0
     return np.asarray(model * wider[:, None] * wider)
 
 
@@ -416,8 +466,7 @@ def _used(joint: _Joint, estimate: Estimate) -> tuple[Rows, NDArray[np.bool_], N
     whitening = whiten(
         linear.pose, joint.noise.white, covariance, linear.arm_m, has_orientation=has_orientation
     )
-    step_square = _pairwise(linear.walk**2 / _walk_variance(rows, joint.unknowns, joint.noise))
-    lost = np.max(step_square, axis=1) > LOST_SQUARE
+    lost = _steps_lost(joint.trajectory, rows, joint.unknowns, joint.noise)
     good = linear.known & (whitening.square <= OUTLIER_SQUARE) & ~lost[rows.interval]
     if np.count_nonzero(good) < 3:
         good = linear.known.copy()

@@ -99,7 +99,8 @@ def offset_by_correlation(
     if motion.turn_rate_radps is not None:
         norms.append((_norm(reference.angular_velocity_radps), columns[1]))
     correlations = [_masked_correlation(theirs, reference.known, own, own_known) for theirs, own in norms]
-    shift, score = correlations[0][0], np.mean([each[1] for each in correlations], axis=0)
+    # An estimate that flies away still turns as the robot does; one whose rotation is wrong still drives.
+    shift, score = max(correlations, key=lambda each: float(each[1].max()))
     offset_s = start_s + (first_ns - own_first_ns) / 1e9 + shift * GRID_S
     found = np.where(np.abs(offset_s - start_s) <= max_offset_s + GRID_S, score, -1.0)
     best = int(np.argmax(found))

@@ -1,17 +1,22 @@
 import dataclasses
 
 import numpy as np
-from harness.compared_drive import START_NS, reference, robot
+import pytest
+from harness.compared_drive import START_NS, long_reference, reference, robot
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.compare import (
     Estimate,
+    ExtrinsicPrior,
     FitSettings,
     FittedPart,
     Relation,
     fit,
+    nested_fits,
+    overlap_s,
+    pair,
 )
-from tsgt.geometry import FloatArray, invert, log_so3, quaternion_from_rotation, transform_from
+from tsgt.geometry import FloatArray, exp_so3, invert, log_so3, quaternion_from_rotation, transform_from
 
 EXTRINSIC = transform_from(
     Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix(), np.array([0.3, -0.2, 0.8])
@@ -84,3 +89,161 @@ def test_skew_and_scale_are_fitted_when_asked_for() -> None:
     settings = FitSettings(frozenset({"offset", "skew", "scale", "extrinsic", "frame"}), "rigid")
     found = fit(reference(40.0, 0.01), seen(np.arange(3.0, 35.0, 0.1), true), settings)
     assert difference(found.relation, true) < 2e-6
+
+
+@pytest.mark.parametrize("offset_s", [-47.3, 0.0, 2.1])
+def test_seconds_of_offset_are_found(offset_s: float) -> None:
+    """From motion alone; the estimate covers a part of the reference, with a dropout."""
+    time_s = np.concatenate([np.arange(62.0, 80.0, 0.1), np.arange(84.0, 110.0, 0.1)])
+    true = dataclasses.replace(TRUE, offset_s=offset_s)
+    found = fit(long_reference(), noisy(seen(time_s, true), 1), FitSettings(EVERYTHING, "rigid"))
+    assert abs(found.relation.offset_s - offset_s) < 0.002
+
+
+def test_stated_sigmas_fit_the_errors() -> None:
+    """Normalised errors of white noise, over a few draws: not far above 1, not far below."""
+    normalised = []
+    for seed in range(4):
+        found = fit(
+            reference(40.0),
+            noisy(seen(np.arange(3.0, 35.0, 0.1), TRUE), seed),
+            FitSettings(EVERYTHING, "rigid"),
+        )
+        arm = found.relation.T_point_sensor[:3, 3] - EXTRINSIC[:3, 3]
+        errors = {
+            "offset_s": found.relation.offset_s - TRUE.offset_s,
+            "extrinsic_x_m": arm[0],
+            "extrinsic_y_m": arm[1],
+        }
+        sigmas = np.sqrt(np.diag(found.covariance))
+        normalised += [errors[name] / sigmas[found.names.index(name)] for name in errors]
+    assert 0.3 < np.sqrt(np.mean(np.square(normalised))) < 1.7
+
+
+def test_estimate_that_flies_away_does_not_move_offset_and_extrinsic() -> None:
+    """Its last third accelerates away; those poses are not used."""
+    time_s = np.arange(2.0, 38.0, 0.1)
+    good = noisy(seen(time_s, TRUE), 2)
+    away_m = 0.5 * np.maximum(time_s - 26.0, 0.0)[:, None] ** 2 * np.array([1.0, 0.5, 0.2])
+    lost = dataclasses.replace(good, position_m=good.position_m + away_m)
+    before, after = (fit(reference(40.0), each, FitSettings(EVERYTHING, "rigid")) for each in (good, lost))
+    assert abs(after.relation.offset_s - TRUE.offset_s) < 0.003
+    assert np.abs(after.relation.T_point_sensor[:3, 3] - EXTRINSIC[:3, 3]).max() < 0.03
+    assert (
+        np.abs(after.relation.T_station1_frame[:3, 3] - before.relation.T_station1_frame[:3, 3]).max() < 0.05
+    )
+    assert after.used[time_s < 25.5].mean() > 0.95
+    assert after.used[time_s > 28.0].mean() < 0.05
+
+
+def test_vertical_lever_arm_is_unobservable_on_level_ground() -> None:
+    """It is named, and left at its prior."""
+    made = reference(40.0)
+    level = made.T_station1_point.copy()
+    heading = np.arctan2(level[:, 1, 0], level[:, 0, 0])
+    level[:, :3, :3] = exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0]))
+    flat = dataclasses.replace(made, T_station1_point=level)
+    sensor = level @ EXTRINSIC
+    rows = slice(20, 780, 2)
+    estimate = noisy(
+        Estimate(
+            "flat",
+            made.stamp_ns[rows],
+            sensor[rows, :3, 3],
+            quaternion_from_rotation(sensor[rows, :3, :3]),
+            None,
+        ),
+        3,
+    )
+    found = fit(flat, estimate, FitSettings(EVERYTHING, "rigid"))
+    assert found.unobservable == ("extrinsic_z_m",)
+    assert found.relation.T_point_sensor[2, 3] == 0.0
+    prior = ExtrinsicPrior(
+        transform_from(EXTRINSIC[:3, :3], np.array([0.0, 0.0, 0.75])), np.array([1.0] * 3 + [0.2] * 3)
+    )
+    known = fit(flat, estimate, FitSettings(EVERYTHING, "rigid", extrinsic_prior=prior))
+    assert known.relation.T_point_sensor[2, 3] == 0.75
+
+
+def test_extrinsic_known_exactly_stays() -> None:
+    """A prior sigma of zero; it has no sigma of its own then."""
+    prior = ExtrinsicPrior(EXTRINSIC, np.zeros(6))
+    settings = FitSettings(EVERYTHING, "rigid", extrinsic_prior=prior)
+    found = fit(reference(40.0), noisy(seen(np.arange(3.0, 35.0, 0.1), TRUE), 4), settings)
+    np.testing.assert_allclose(found.relation.T_point_sensor, EXTRINSIC, atol=1e-15)
+    assert not any(name.startswith("extrinsic") for name in found.names)
+    assert abs(found.relation.offset_s - TRUE.offset_s) < 0.003
+
+
+def test_yaw_alignment_keeps_the_estimate_level() -> None:
+    """Four degrees of freedom are fitted and have sigmas."""
+    true = dataclasses.replace(TRUE, T_station1_frame=LEVEL_FRAME)
+    found = fit(
+        reference(40.0), noisy(seen(np.arange(3.0, 35.0, 0.1), true), 5), FitSettings(EVERYTHING, "yaw")
+    )
+    np.testing.assert_allclose(found.relation.T_station1_frame[2, :3], [0.0, 0.0, 1.0], atol=1e-12)
+    assert [n for n in found.names if n.startswith("frame")] == [
+        "frame_x_m",
+        "frame_y_m",
+        "frame_z_m",
+        "frame_yaw_rad",
+    ]
+
+
+def test_alignment_at_the_start_ignores_what_drifts_later() -> None:
+    """The first five seconds agree, the end has the drift."""
+    time_s = np.arange(3.0, 35.0, 0.1)
+    exact = seen(time_s, TRUE)
+    drift_m = 0.01 * (time_s - 3.0)[:, None] * (FRAME[:3, :3].T @ np.array([1.0, 0.0, 0.0]))
+    estimate = dataclasses.replace(exact, position_m=exact.position_m + drift_m)
+    found = fit(reference(40.0), estimate, FitSettings(EVERYTHING, "start"))
+    paired = pair(reference(40.0), estimate, found.relation)
+    error_m = (paired.estimated - paired.reference)[:, :3, 3]
+    assert np.abs(error_m[:50].mean(axis=0)).max() < 0.002
+    assert abs(error_m[-1, 0] - 0.294) < 0.01
+
+
+def test_what_is_not_asked_for_keeps_its_value() -> None:
+    """The offset is right all the same: the extrinsic is fitted with it, but not applied."""
+    settings = FitSettings(frozenset({"offset", "frame"}), "start")
+    found = fit(reference(40.0), noisy(seen(np.arange(3.0, 35.0, 0.1), TRUE), 6), settings)
+    np.testing.assert_array_equal(found.relation.T_point_sensor, np.eye(4))
+    assert abs(found.relation.offset_s - TRUE.offset_s) < 0.003
+    assert found.relation.skew == 0.0
+    assert found.relation.scale == 1.0
+
+
+def test_nested_fits_show_what_each_part_hides() -> None:
+    """The error does not grow from set to set once a frame is fitted."""
+    estimate = noisy(seen(np.arange(3.0, 35.0, 0.1), TRUE), 7)
+    settings = FitSettings(EVERYTHING | {"scale"}, "rigid")
+    found = nested_fits(reference(40.0), estimate, settings)
+    assert [(own.parts, own.align) for own, _ in found] == [
+        (frozenset(), "none"),
+        ({"offset"}, "none"),
+        ({"offset", "frame"}, "start"),
+        ({"offset", "frame", "extrinsic"}, "start"),
+        ({"offset", "frame", "extrinsic"}, "rigid"),
+        ({"offset", "frame", "extrinsic", "scale"}, "rigid"),
+    ]
+    rms_m = []
+    for _, each in found[2:5]:
+        paired = pair(reference(40.0), estimate, each.relation)
+        rms_m.append(
+            float(np.sqrt(((paired.estimated - paired.reference)[:, :3, 3] ** 2).sum(axis=1).mean()))
+        )
+    assert rms_m[0] > 1.0 > 0.05 > rms_m[1] > rms_m[2]
+
+
+def test_overlap_is_stated_in_seconds() -> None:
+    """Negative: the time between them."""
+    estimate = seen(np.arange(3.0, 13.05, 0.1), dataclasses.replace(TRUE, offset_s=0.0))
+    assert overlap_s(reference(10.0), estimate) == pytest.approx(6.95)
+    assert overlap_s(reference(10.0), estimate, offset_s=10.0) == pytest.approx(-3.05)
+
+
+def test_too_little_of_the_estimate_is_refused() -> None:
+    """A second of poses determines nothing."""
+    estimate = seen(np.arange(3.0, 4.0, 0.1), dataclasses.replace(TRUE, offset_s=0.0))
+    with pytest.raises(ValueError, match="at least 5 poses over 2 s"):
+        fit(reference(10.0), estimate, FitSettings())

@@ -17,14 +17,15 @@ from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionR
 if TYPE_CHECKING:
     from pathlib import Path
 
-MAX_MEASUREMENTS = 10_000  # more than an hour; older ones stay in the journals
+MAX_MEASUREMENTS = 200_000  # 22 hours at 2.5 Hz, some 40 MB; older ones stay in the journals
+MAX_RECEPTIONS = 10_000  # more than an hour
 
 STREAM_ID_BITS = 16
 
 _TAIL_BYTES = 8_000_000
 _TAIL_GROWTH = 4
-"""The tail of a journal that holds this many measurements with the beacons between them. Where it holds fewer, a longer tail
-is read: beacons alone fill it in six hours."""
+"""The tail of a journal of more than an hour with the beacons between the measurements. Where it does not reach back to the oldest
+measurement that is not acknowledged, a longer one is read; beacons alone fill it in six hours."""
 
 log = structlog.get_logger()
 
@@ -85,13 +86,13 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     # The times of a run that received no beacon rest on the receptions of earlier runs on the same clock.
     boots = {each.boot for each in undelivered}
     for head, path in reversed(journals):
-        if path not in stream.paths and head.boot in boots and len(receptions) < MAX_MEASUREMENTS:
+        if path not in stream.paths and head.boot in boots and len(receptions) < MAX_RECEPTIONS:
             receptions = _tail(head, path).receptions + receptions
     return Backlog(
         stream_id=stream.stream_id,
         first_sequence=stream.last_sequence + 1 + RESTART_SKIP,
         queued=tuple(undelivered[-MAX_MEASUREMENTS:]),
-        receptions=tuple(sorted(receptions[-MAX_MEASUREMENTS:], key=attrgetter("received_ns"))),
+        receptions=tuple(sorted(receptions[-MAX_RECEPTIONS:], key=attrgetter("received_ns"))),
     )
 
 
@@ -186,7 +187,7 @@ def _read_last(size: int, head: JournalRecord, path: Path) -> tuple[_Tail, bool]
     except OSError as error:
         log.warning("journal_unreadable", path=str(path), error=error.strerror or str(error))
         return tail, True
-    sufficient = acknowledged and len(tail.measurements) > 0
+    sufficient = acknowledged and bool(tail.measurements) and tail.measurements[0].sequence <= tail.oldest
     return tail, sufficient or start == 0 or len(tail.measurements) > MAX_MEASUREMENTS
 
 

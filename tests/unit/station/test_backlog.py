@@ -141,7 +141,7 @@ def test_only_necessary_journals_are_read(tmp_path: Path, monkeypatch: pytest.Mo
         read.append(path.stem)
         return tail(head, path)
 
-    monkeypatch.setattr(backlog_module, "MAX_MEASUREMENTS", 2)
+    monkeypatch.setattr(backlog_module, "MAX_RECEPTIONS", 2)
     monkeypatch.setattr(backlog_module, "_tail", noted)
     journal(tmp_path, "station1-a", head(0), reception(1), *measured(0))
     journal(tmp_path, "station1-b", head(1001), reception(2), reception(3, received_ns=9_000))
@@ -197,10 +197,33 @@ def test_oldest_measurements_beyond_capacity_are_discarded(
 def test_only_tail_of_long_journal_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that ran for days starts as fast as any other."""
     monkeypatch.setattr(backlog_module, "_TAIL_BYTES", 1000)
-    journal(tmp_path, "station1-a", head(0), *measured(*range(99)), acknowledged(5), *measured(99))
+    journal(tmp_path, "station1-a", head(0), *measured(*range(99)), acknowledged(98), *measured(99))
+    read = []
+
+    def noted(measurement: PolarMeasurement, zero_ns: int, boot: str) -> object:
+        read.append(measurement)
+        return queued_measurement(measurement, zero_ns, boot)
+
+    monkeypatch.setattr(backlog_module, "queued_measurement", noted)
     backlog = read_backlog(tmp_path, 1)
-    assert 1 <= len(backlog.queued) < 10
+    assert queued_sequences(backlog) == [98, 99]
+    assert len(read) < 10
     assert backlog.first_sequence == 100 + RESTART_SKIP
+
+
+def test_tail_is_extended_to_the_oldest_measurement_not_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a long outage they fill more than the tail."""
+    monkeypatch.setattr(backlog_module, "_TAIL_BYTES", 1000)
+    journal(tmp_path, "station1-a", head(0), *measured(*range(99)), acknowledged(5), *measured(99))
+    assert queued_sequences(read_backlog(tmp_path, 1)) == list(range(5, 100))
+
+
+def test_backlog_of_a_day_is_whole(tmp_path: Path) -> None:
+    """Every measurement that a journal holds arrives, whatever the length of the outage."""
+    journal(tmp_path, "station1-a", head(0), acknowledged(0), *measured(*range(15_000)))
+    assert queued_sequences(read_backlog(tmp_path, 1)) == list(range(15_000))
 
 
 def test_tail_is_extended_to_last_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

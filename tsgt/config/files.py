@@ -32,6 +32,8 @@ Config = Annotated[
     Field(discriminator="kind"),
 ]
 
+_MAX_BYTES = 4_000_000  # Bounds what is read of a device or another large file
+
 # All kinds of files, by the value of their top-level key ``kind``.
 KINDS: dict[str, type[Model]] = {
     "client": ClientConfig,
@@ -90,11 +92,18 @@ def json_schema(kind: str | None = None) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file", path=path) from None
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}", path=path) from error
+    if len(content) > _MAX_BYTES:
+        raise ConfigError(
+            f"{path}: larger than {_MAX_BYTES // 1_000_000} MB; name a configuration", path=path
+        )
+    try:
+        return tomllib.loads(content.decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})", path=path) from error
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:  # huge numbers, deep nesting

@@ -121,6 +121,12 @@ def test_error_has_the_key_as_data(tmp_path: Path) -> None:
     assert error.value.key == "pipeline.outage_limit_s"
 
 
+def test_endless_file() -> None:
+    """A device in place of a file is not read to its end."""
+    with pytest.raises(ConfigError, match="/dev/zero: larger than 4 MB; name a configuration"):
+        load(Path("/dev/zero"), MasterConfig)
+
+
 def test_missing_file(tmp_path: Path) -> None:
     """The error names the file."""
     with pytest.raises(ConfigError, match=r"nowhere\.toml: no such file"):

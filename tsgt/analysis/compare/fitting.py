@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
     from tsgt.geometry import FloatArray
 
+    _Used = tuple[Rows, NDArray[np.bool_], NDArray[np.bool_]]
+    """All poses that are paired; which poses of the estimate were used, (M,); and which of the rows, (N,)."""
+
 MIN_STEP_S = 0.04
 MAX_ROWS = 15_000
 """Poses of an estimate that a fit uses: at 25 Hz what its errors share outweighs what more poses add."""
@@ -115,7 +118,8 @@ def fit(
     """
     start = initial_relation() if start is None else start
     trajectory = ReferenceTrajectory(reference)
-    return _applied(_fit_jointly(trajectory, estimate, settings, start), estimate, settings, start)
+    joint = _fit_jointly(trajectory, estimate, settings, start)
+    return _applied(joint, _used(joint, estimate), settings, start)
 
 
 def nested_fits(
@@ -139,16 +143,23 @@ def nested_fits(
     ]
     parts: set[FittedPart] = set()
     found: list[tuple[FitSettings, Fit]] = []
-    joints: dict[frozenset[FittedPart], _Joint] = {}
+    joints: dict[frozenset[FittedPart], tuple[_Joint, _Used]] = {}
     for added, align in steps:
         if not added <= settings.parts:
             continue
         parts |= added
         own = replace(settings, parts=frozenset(parts), align=align if "frame" in parts else "none")
+        if not own.parts:
+            prior = settings.extrinsic_prior
+            given = start if prior is None else replace(start, T_point_sensor=prior.T_point_sensor)
+            used = trajectory.covers(on_reference_clock(estimate, given))
+            found.append((own, Fit(given, (), np.zeros((0, 0)), (), used)))
+            continue
         key = own.parts & {"offset", "skew", "scale"}
         if key not in joints:
-            joints[key] = _fit_jointly(trajectory, estimate, own, start)
-        found.append((own, _applied(joints[key], estimate, own, start)))
+            joint = _fit_jointly(trajectory, estimate, own, start)
+            joints[key] = joint, _used(joint, estimate)
+        found.append((own, _applied(*joints[key], own, start)))
     return found
 
 
@@ -423,7 +434,7 @@ def _covariance(solved: Solved, rows: Rows) -> FloatArray:
     return np.asarray(model * wider[:, None] * wider)
 
 
-def _applied(joint: _Joint, estimate: Estimate, settings: FitSettings, start: Relation) -> Fit:
+def _applied(joint: _Joint, found: _Used, settings: FitSettings, start: Relation) -> Fit:
     """Return the relation with the parts asked for, and the frame by its alignment."""
     unknowns = joint.unknowns
     prior = settings.extrinsic_prior
@@ -444,7 +455,7 @@ def _applied(joint: _Joint, estimate: Estimate, settings: FitSettings, start: Re
     unobservable = tuple(
         n for n in joint.unobservable if not n.startswith("extrinsic") or "extrinsic" in settings.parts
     )
-    rows, used, good = _used(joint, estimate)
+    rows, used, good = found
     if "frame" in settings.parts and settings.align != "none":
         relation, by_unknowns, own, determined = _with_frame(joint, rows, good, settings.align, relation)
         cross = by_unknowns[:, stated] @ covariance
@@ -456,7 +467,7 @@ def _applied(joint: _Joint, estimate: Estimate, settings: FitSettings, start: Re
     return Fit(relation, names, covariance, unobservable, used)
 
 
-def _used(joint: _Joint, estimate: Estimate) -> tuple[Rows, NDArray[np.bool_], NDArray[np.bool_]]:
+def _used(joint: _Joint, estimate: Estimate) -> _Used:
     """Return all poses that are paired, of the estimate a mask of the used ones, (M,), and of the rows, (N,)."""
     relation = Relation(joint.unknowns.offset_s, joint.unknowns.skew, np.eye(4), np.eye(4), 1.0)
     rows = all_rows(estimate, joint.rows, joint.trajectory.covers(on_reference_clock(estimate, relation)))

@@ -16,6 +16,7 @@ setup(
         "console_scripts": [
             f"pose_publisher = {NAME}.pose_publisher:main",
             f"imu_lines = {NAME}.imu_lines:main",
+            f"odometry_lines = {NAME}.odometry_lines:main",
         ]
     },
 )

@@ -14,13 +14,15 @@ from tsgt.simulation.checks import oversized_collections
 from tsgt.simulation.faults import (
     FAULT_FREE_TAIL_S,
     IMU_FAULTS,
+    ODOMETRY_FAULTS,
     draw_faults,
     imu_conditions,
     inject_fault,
+    odometry_conditions,
     relock_instruments,
 )
 from tsgt.simulation.kernel import VirtualTimeline, run_virtual
-from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult
+from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult, has_odometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -60,9 +62,15 @@ def simulate(
             duration_s=options.duration_s,
             stations=[station.station for station in scenario.stations],
             imu=scenario.imu.model != "none",
+            odometry=has_odometry(scenario),
         )
         mission = Mission(
-            scenario, options, folder=folder, timeline=timeline, imu_conditions=imu_conditions(faults)
+            scenario,
+            options,
+            folder=folder,
+            timeline=timeline,
+            imu_conditions=imu_conditions(faults),
+            odometry_conditions=odometry_conditions(faults),
         )
         for station in scenario.stations:
             mission.start_station(station.station)
@@ -71,7 +79,11 @@ def simulate(
             *([script(mission)] if script is not None else []),
             *(mission.apply_outage(outage) for outage in options.outages),
             *(mission.restart(restart.station, restart.at_s) for restart in options.restarts),
-            *(inject_fault(mission, fault) for fault in faults if fault.kind not in IMU_FAULTS),
+            *(
+                inject_fault(mission, fault)
+                for fault in faults
+                if fault.kind not in IMU_FAULTS | ODOMETRY_FAULTS
+            ),
             *([mission.run_interference()] if options.interference_rate_hz else []),
             *([relock_instruments(mission, options.duration_s - FAULT_FREE_TAIL_S)] if faults else []),
         ]
@@ -109,6 +121,7 @@ def simulate(
             rate_hz={station.station: station.rate_hz for station in scenario.stations},
             oversized_collections=tuple(sorted(oversized)),
             imu=mission.imu,
+            odometry=mission.odometry,
         )
 
     return run_virtual(run, timeline, isolated=True)

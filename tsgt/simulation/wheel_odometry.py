@@ -5,14 +5,14 @@ Incremental encoders count over an interval: a sample is the mean over the time 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
 
 from tsgt.geometry import rotate
-from tsgt.simulation.imu import DeviceProgram
+from tsgt.simulation.imu import DeviceProgram, Silence, StuckValues
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -47,15 +47,32 @@ class OdometryModel:
 
 
 @dataclass(frozen=True, slots=True)
+class WheelSlip:
+    """The wheels spin, slide or are locked: they turn ``factor`` times as fast as the robot moves, and as they would turn it."""
+
+    at_s: float
+    duration_s: float
+    factor: float
+
+
+OdometryCondition = Silence | StuckValues | WheelSlip
+
+
+@dataclass(frozen=True, slots=True)
 class OdometrySamples:
     """N samples of wheel odometry, each the mean over the interval that ends at ``time_s``."""
 
+    counter: NDArray[np.int64]  # (N,) of each sample; those that are not delivered are counted
     time_s: NDArray[np.float64]  # (N,) in s from the start of the mission
     arrival_s: NDArray[np.float64]  # (N,) at the host
     speed_mps: NDArray[np.float64]  # (N,) of the robot's origin along its x axis, positive forwards
     yaw_rate_radps: NDArray[np.float64]  # (N,) about the robot's z axis, positive to the left
     true_speed_mps: NDArray[np.float64]  # (N,)
     true_yaw_rate_radps: NDArray[np.float64]  # (N,)
+
+    def select(self, rows: NDArray[np.bool_]) -> OdometrySamples:
+        """Return the samples of some rows."""
+        return OdometrySamples(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
 def simulate_odometry(
@@ -64,8 +81,12 @@ def simulate_odometry(
     until_s: float,
     *,
     seed: Sequence[int],
+    conditions: Sequence[OdometryCondition] = (),
 ) -> OdometrySamples:
-    """Simulate wheel odometry from the start of a mission to ``until_s``; ``motion_at`` covers this time."""
+    """Simulate wheel odometry from the start of a mission to ``until_s``; ``motion_at`` covers this time.
+
+    ``conditions``: faults; without any, or with others, the samples outside their times are the same.
+    """
     rng = np.random.default_rng([*seed, 0x0D])
     time_s = np.arange(rng.uniform(0.0, 1.0 / model.rate_hz), until_s, 1.0 / model.rate_hz)
     parts = (np.arange(_PARTS) + 0.5) / _PARTS - 1.0
@@ -77,7 +98,8 @@ def simulate_odometry(
     scale = 1.0 + rng.normal(0.0, model.scale_error, 2) + _gauss_markov(model, len(time_s), rng)
     noise = rng.standard_normal((2, len(time_s)))
     delay_s = ODOMETRY_DELAY_S + rng.exponential(_MEAN_JITTER_S, len(time_s))
-    return OdometrySamples(
+    samples = OdometrySamples(
+        np.arange(len(time_s)),
         time_s,
         np.maximum.accumulate(time_s + delay_s),
         scale[:, 0] * speed + model.speed_noise_mps * noise[0],
@@ -85,6 +107,25 @@ def simulate_odometry(
         speed,
         yaw_rate,
     )
+    for condition in conditions:
+        samples = _under(condition, samples)
+    return samples
+
+
+def _under(condition: OdometryCondition, samples: OdometrySamples) -> OdometrySamples:
+    """Return the samples as they are under a condition."""
+    within = (samples.time_s >= condition.at_s) & (samples.time_s < condition.at_s + condition.duration_s)
+    rows = np.flatnonzero(within)
+    if isinstance(condition, Silence):
+        return samples.select(~within)
+    speed, yaw_rate = samples.speed_mps.copy(), samples.yaw_rate_radps.copy()
+    if isinstance(condition, WheelSlip):
+        speed[rows] *= condition.factor
+        yaw_rate[rows] *= condition.factor
+    elif len(rows):
+        last = max(int(rows[0]) - 1, 0)
+        speed[rows], yaw_rate[rows] = speed[last], yaw_rate[last]
+    return replace(samples, speed_mps=speed, yaw_rate_radps=yaw_rate)
 
 
 class OdometryProgram(DeviceProgram):
@@ -102,7 +143,7 @@ class OdometryProgram(DeviceProgram):
         def line_of(rows: slice) -> dict[str, object]:
             return {
                 "type": "samples",
-                "counter": list(range(len(samples.time_s)))[rows],
+                "counter": samples.counter[rows].tolist(),
                 "instrument_time_ns": np.rint(samples.time_s[rows] * 1e9).astype(np.int64).tolist(),
                 "host_time_ns": np.rint(samples.arrival_s[rows] * 1e9).astype(np.int64).tolist(),
                 "speed_mps": np.round(samples.speed_mps[rows], 6).tolist(),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tsgt.config import ScenarioConfig
-from tsgt.simulation.wheel_odometry import OdometryModel, simulate_odometry
+from tsgt.simulation.imu import Silence, StuckValues
+from tsgt.simulation.wheel_odometry import OdometryModel, WheelSlip, simulate_odometry
 from tsgt.simulation.world import World, scenario_world
 
 EXACT = OdometryModel(scale_error=0.0, slip=0.0, speed_noise_mps=0.0, yaw_rate_noise_radps=0.0)
@@ -56,3 +57,19 @@ def test_noise_and_determinism() -> None:
     assert not np.array_equal(one.speed_mps[:100], other.speed_mps[:100])
     assert (one.speed_mps - one.true_speed_mps).std() == pytest.approx(0.01, rel=0.05)
     assert (one.yaw_rate_radps - one.true_yaw_rate_radps).std() == pytest.approx(0.02, rel=0.05)
+
+
+def test_conditions_change_their_time_alone() -> None:
+    """Silent wheels count on; stuck ones repeat the last value; those that spin show a multiple of the speed."""
+    conditions = (Silence(10.0, 2.0), StuckValues(20.0, 3.0), WheelSlip(30.0, 1.0, 1.5))
+    sound = simulate_odometry(OdometryModel(), _world().motion_at, 40.0, seed=[1])
+    found = simulate_odometry(OdometryModel(), _world().motion_at, 40.0, seed=[1], conditions=conditions)
+    assert found.counter[0] == 0
+    assert found.counter[-1] == len(sound.time_s) - 1
+    silent = (sound.time_s >= 10.0) & (sound.time_s < 12.0)
+    np.testing.assert_array_equal(found.time_s, sound.time_s[~silent])
+    expected = sound.speed_mps.copy()
+    stuck = (sound.time_s >= 20.0) & (sound.time_s < 23.0)
+    expected[stuck] = expected[np.flatnonzero(stuck)[0] - 1]
+    expected[(sound.time_s >= 30.0) & (sound.time_s < 31.0)] *= 1.5
+    np.testing.assert_array_equal(found.speed_mps, expected[~silent])

@@ -44,6 +44,7 @@ from tsgt.simulation.faults import (
     FAULT_FREE_START_S,
     FAULT_FREE_TAIL_S,
     IMU_FAULTS,
+    ODOMETRY_FAULTS,
     FaultKind,
     parse_faults,
 )
@@ -215,6 +216,10 @@ def simulate_command(
     if faults and faults <= IMU_FAULTS and scenario.imu.model == "none":
         raise click.UsageError(
             "--faults: these are faults of the IMU, and the robot has none; add --imu industrial"
+        )
+    if faults and faults <= ODOMETRY_FAULTS and not scenario.odometry:
+        raise click.UsageError(
+            "--faults: these are faults of the wheel odometry, and the robot has none; add --imu industrial --odometry"
         )
     options = SimulationOptions(
         duration_s=scenario.duration_s if duration_s is None else duration_s,

@@ -17,6 +17,7 @@ from tsgt.model import Status
 from tsgt.recording import load_recording
 from tsgt.simulation.checks.imu_samples import imu_failures
 from tsgt.simulation.checks.liveness import liveness_failures
+from tsgt.simulation.checks.odometry_samples import odometry_failures
 from tsgt.simulation.checks.pose_consistency import pose_failures
 from tsgt.simulation.mission import JournalIndex
 
@@ -59,7 +60,7 @@ def check_invariants(result: MissionResult) -> list[Violation]:
     - Timestamp errors are within the stated bounds.
     - Valid poses rest on usable measurements and agree with the truth within their covariance.
     - A replay of the recording reproduces the stream.
-    - Recorded samples of the IMU are those that it gave, at their true times.
+    - Recorded samples of IMU and wheel odometry are those that they gave, at their true times; silent wheels are an event.
     - After the faults, rates recover; collections in memory stay bounded.
     """
     found: list[Violation] = []
@@ -79,6 +80,7 @@ def check_invariants(result: MissionResult) -> list[Violation]:
         found += (Violation("pose", what) for what in pose_failures(master_log, result))
         found += replay_mismatches(master_log)
     found += (Violation("imu", what) for what in imu_failures(result))
+    found += (Violation("odometry", what) for what in odometry_failures(result))
     found += (Violation("liveness", what) for what in liveness_failures(result, indices))
     found += (Violation("memory", what) for what in result.oversized_collections)
     return found

@@ -1,7 +1,7 @@
 """Faults of a mission: drawn from the seed, injected at their times, removed before the fault-free tail.
 
 In: kinds of faults, a random generator, a running mission. Out: `draw_faults` gives the faults, `inject_fault` applies one;
-`imu_conditions` gives those of the IMU, whose samples are simulated before the mission.
+`imu_conditions` and `odometry_conditions` give those of IMU and wheels, whose samples are simulated before the mission.
 """
 
 from tsgt.simulation.faults.catalogue import (
@@ -10,12 +10,14 @@ from tsgt.simulation.faults.catalogue import (
     FAULT_FREE_TAIL_S,
     IMU_FAULTS,
     Fault,
+    ODOMETRY_FAULTS,
     FaultKind,
     draw_faults,
     parse_faults,
 )
 from tsgt.simulation.faults.imu_conditions import imu_conditions
 from tsgt.simulation.faults.injection import inject_fault, relock_instruments
+from tsgt.simulation.faults.odometry_conditions import odometry_conditions
 
 __all__ = [
     "FAST_SYNC_CYCLES",
@@ -23,10 +25,12 @@ __all__ = [
     "FAULT_FREE_TAIL_S",
     "IMU_FAULTS",
     "Fault",
+    "ODOMETRY_FAULTS",
     "FaultKind",
     "draw_faults",
     "imu_conditions",
     "inject_fault",
+    "odometry_conditions",
     "parse_faults",
     "relock_instruments",
 ]

@@ -99,6 +99,13 @@ class FaultKind(StrEnum):
     IMU_KNOCK = "imu-knock"
     """The IMU is turned by 1 degree and moved by 20 mm on the robot, and stays so."""
 
+    ODOMETRY_SILENCE = "odometry-silence"
+    """The wheel odometry delivers nothing."""
+    ODOMETRY_STUCK = "odometry-stuck"
+    """The wheel odometry repeats its last values; its counter and clock run on."""
+    ODOMETRY_SLIP = "odometry-slip"
+    """The wheels spin, slide or are locked: the measured speed is 0 to 2.5 times the true one."""
+
 
 # Further kinds come last: the draws of the others stay the same.
 
@@ -111,7 +118,7 @@ class _FaultRate(NamedTuple):
     duration_s: tuple[float, float]
 
 
-_M, _S, _B, _I = "master", "stations", "both", "imu"
+_M, _S, _B, _I, _O = "master", "stations", "both", "imu", "odometry"
 _RATES: Final = {
     FaultKind.LOSS: _FaultRate(40, _S, (0.5, 20)),
     FaultKind.JAMMING: _FaultRate(10, _M, (0.2, 8)),
@@ -145,6 +152,9 @@ _RATES: Final = {
     FaultKind.IMU_LATE_BURST: _FaultRate(15, _I, (0.05, 3)),
     FaultKind.IMU_SATURATION: _FaultRate(8, _I, (0.5, 20)),
     FaultKind.IMU_KNOCK: _FaultRate(2, _I, (0, 0)),
+    FaultKind.ODOMETRY_SILENCE: _FaultRate(10, _O, (0.1, 30)),
+    FaultKind.ODOMETRY_STUCK: _FaultRate(10, _O, (0.1, 30)),
+    FaultKind.ODOMETRY_SLIP: _FaultRate(20, _O, (0.3, 20)),
 }
 
 RATE_FACTOR = 3.0
@@ -157,13 +167,16 @@ class Fault(NamedTuple):
 
     at_s: float  # start in s from the start of the mission
     kind: FaultKind
-    station: int | None  # None: the master, its IMU, or the channel
+    station: int | None  # None: the master, its IMU or wheel odometry, or the channel
     duration_s: float  # 0: instantaneous
     seed: int  # seed of further draws
 
 
 IMU_FAULTS: Final = frozenset(kind for kind, rate in _RATES.items() if rate.targets == _I)
 """Kinds of faults that only a robot with an IMU has."""
+
+ODOMETRY_FAULTS: Final = frozenset(kind for kind, rate in _RATES.items() if rate.targets == _O)
+"""Kinds of faults that only a robot with wheel odometry has."""
 
 
 def parse_faults(text: str) -> frozenset[FaultKind]:
@@ -190,20 +203,22 @@ def draw_faults(
     duration_s: float,
     stations: Sequence[int],
     imu: bool = False,
+    odometry: bool = False,
 ) -> tuple[Fault, ...]:
-    """Draw the faults of a mission, sorted by start; without an IMU none of :data:`IMU_FAULTS`.
+    """Draw the faults of a mission, sorted by start; without an IMU none of :data:`IMU_FAULTS`, and likewise without wheel odometry.
 
     The rate of each kind is scaled by a random factor between 1/8 and 8. With more than one kind, each is omitted with a
     probability of 0.3. All faults end :data:`FAULT_FREE_TAIL_S` before ``duration_s``.
     """
-    ordered = sorted(set(kinds) - (frozenset() if imu else IMU_FAULTS), key=list(FaultKind).index)
+    impossible = (frozenset() if imu else IMU_FAULTS) | (frozenset() if odometry else ODOMETRY_FAULTS)
+    ordered = sorted(set(kinds) - impossible, key=list(FaultKind).index)
     end_s = duration_s - FAULT_FREE_TAIL_S
     faults = []
     for kind in ordered:
         factor, omitted = _RATE_SPREAD ** rng.uniform(-1, 1), rng.random() < _OMIT_PROBABILITY
         rate = _RATES[kind]
         for station in [
-            *([None] if rate.targets in (_M, _B, _I) else []),
+            *([None] if rate.targets in (_M, _B, _I, _O) else []),
             *(stations if rate.targets in (_S, _B) else []),
         ]:
             count = rng.poisson(

@@ -5,7 +5,7 @@ the ground truth. `Mission` also starts, stops, kills and reboots computers for 
 """
 
 from tsgt.simulation.mission.computer import MASTER
-from tsgt.simulation.mission.daemon_configs import instrument_config, station_name
+from tsgt.simulation.mission.daemon_configs import has_odometry, instrument_config, station_name
 from tsgt.simulation.mission.mission import DRAIN_S, Mission
 from tsgt.simulation.mission.run_log import JournalIndex, MasterLog, MissionResult, StationLog, ValidPoses
 
@@ -18,6 +18,7 @@ __all__ = [
     "MissionResult",
     "StationLog",
     "ValidPoses",
+    "has_odometry",
     "instrument_config",
     "station_name",
 ]

@@ -97,8 +97,13 @@ def _imu_config(scenario: ScenarioConfig) -> ImuConfig | None:
     )
 
 
+def has_odometry(scenario: ScenarioConfig) -> bool:
+    """Whether the robot has wheel odometry, which is used with an IMU."""
+    return scenario.odometry and scenario.imu.model != "none"
+
+
 def _odometry_config(scenario: ScenarioConfig) -> OdometryConfig | None:
-    if not scenario.odometry or scenario.imu.model == "none":
+    if not has_odometry(scenario):
         return None
     return OdometryConfig(
         command=("simulated-odometry",),  # not run either

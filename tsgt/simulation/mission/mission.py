@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.imu import ImuCondition, SimulatedImuRun
     from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.options import Outage, SimulationOptions
-    from tsgt.simulation.wheel_odometry import OdometrySamples
+    from tsgt.simulation.wheel_odometry import OdometryCondition, OdometrySamples
     from tsgt.simulation.world import World
     from tsgt.station import Reading
 
@@ -69,7 +69,7 @@ _YEAR_NS = 365 * 86_400 * 10**9
 class Mission:
     """A mission; create and use it in a running event loop on virtual time. Dictionaries are keyed by station number.
 
-    ``imu_conditions``: faults of the robot's IMU.
+    ``imu_conditions``, ``odometry_conditions``: faults of the robot's IMU and wheel odometry.
     """
 
     def __init__(
@@ -80,6 +80,7 @@ class Mission:
         folder: Path,
         timeline: Timeline,
         imu_conditions: Sequence[ImuCondition] = (),
+        odometry_conditions: Sequence[OdometryCondition] = (),
     ) -> None:
         rng = np.random.default_rng(options.seed)
         world_rng, air_rng, master_rng, clock_rng, *station_rngs = rng.spawn(4 + len(scenario.stations))
@@ -119,7 +120,11 @@ class Mission:
         wheels = master_config(scenario, options, folder).odometry
         if wheels is not None:
             self.odometry = simulate_odometry(
-                OdometryModel(), self.world.motion_at, options.duration_s + DRAIN_S, seed=[options.seed]
+                OdometryModel(),
+                self.world.motion_at,
+                options.duration_s + DRAIN_S,
+                seed=[options.seed],
+                conditions=odometry_conditions,
             )
             self.parameters = replace(self.parameters, odometry=wheels.parameters())
         self._positions_m = {station_name(s.station): s.position_m for s in scenario.stations}

@@ -12,7 +12,15 @@ import numpy as np
 
 from tsgt.estimation import transform_of
 from tsgt.model import ImuSamples, OdometrySamples, PolarMeasurement
-from tsgt.recording import BeaconRecord, ClockRecord, PoseRecord, StatusRecord, decode_line, read_lines
+from tsgt.recording import (
+    BeaconRecord,
+    ClockRecord,
+    EventRecord,
+    PoseRecord,
+    StatusRecord,
+    decode_line,
+    read_lines,
+)
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
 from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
 from tsgt.station.leica import LeicaInstrument
@@ -30,6 +38,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.imu import SimulatedImuRun
     from tsgt.simulation.instrument import ReportedDistance
     from tsgt.simulation.options import Outage
+    from tsgt.simulation.wheel_odometry import OdometrySamples as SimulatedOdometry
     from tsgt.simulation.world import World
     from tsgt.station import ClientStatus, Reading
     from tsgt.station.serial import OpenPort
@@ -80,7 +89,7 @@ class MasterLog:
 
     Attributes
     ----------
-    measurements, clocks, statuses
+    measurements, clocks, statuses, events
         Published records.
     frame_count, frames_duration_ns
         Number of frames from the first to the last beacon, and their total duration.
@@ -96,6 +105,7 @@ class MasterLog:
         self.arrived_ns: list[int] = []  # True time of each measurement's publication, in ns from the start
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
+        self.events: list[EventRecord] = []
         self.pose_counts: Counter[str] = Counter()  # number of poses, valid or not, by series
         self.predicted_with_imu = 0  # number of predicted poses, valid or not, that rest on the IMU
         self.frame_count = 0
@@ -122,6 +132,8 @@ class MasterLog:
             self.clocks.append(record)
         elif isinstance(record, StatusRecord):
             self.statuses.append(record)
+        elif isinstance(record, EventRecord):
+            self.events.append(record)
         elif isinstance(record, PoseRecord):
             self.pose_counts[record.series] += 1
             self.predicted_with_imu += record.kind == "predicted" and record.imu == "used"
@@ -312,6 +324,7 @@ class MissionResult:
     rate_hz: dict[int, float] = field(default_factory=dict)  # measurement rate by station number
     oversized_collections: tuple[str, ...] = ()  # collections of the daemons that exceeded their bounds
     imu: SimulatedImuRun | None = None  # samples and truth of the robot's IMU
+    odometry: SimulatedOdometry | None = None  # samples of its wheel odometry
     start_ns: int = START_UNIX_NS  # unix time of the start on the master's clock, in ns
 
     @property

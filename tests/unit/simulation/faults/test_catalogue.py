@@ -16,9 +16,11 @@ from tsgt.simulation.faults import (
     FAULT_FREE_START_S,
     FAULT_FREE_TAIL_S,
     IMU_FAULTS,
+    ODOMETRY_FAULTS,
     FaultKind,
     draw_faults,
     imu_conditions,
+    odometry_conditions,
     parse_faults,
 )
 from tsgt.simulation.imu import Knock
@@ -53,7 +55,12 @@ def test_single_kind_is_never_omitted() -> None:
     """A kind that is requested alone always occurs."""
     for kind in FaultKind:
         faults = draw_faults(
-            [kind], np.random.default_rng(0), duration_s=36_000.0, stations=[1, 2, 3], imu=True
+            [kind],
+            np.random.default_rng(0),
+            duration_s=36_000.0,
+            stations=[1, 2, 3],
+            imu=True,
+            odometry=True,
         )
         assert {fault.kind for fault in faults} == {kind}
 
@@ -67,6 +74,26 @@ def test_faults_of_the_imu_leave_the_others_as_they_are() -> None:
     assert without == tuple(fault for fault in with_imu if fault.kind not in IMU_FAULTS)
     assert IMU_FAULTS.isdisjoint(fault.kind for fault in without)
     assert len(with_imu) > len(without)
+
+
+def test_faults_of_the_wheels_leave_the_others_as_they_are() -> None:
+    """Without odometry there are none; with it, all others stay the same, bit for bit."""
+    without, with_wheels = (
+        draw_faults(
+            FaultKind,
+            np.random.default_rng(1),
+            duration_s=3600.0,
+            stations=[1, 2, 3],
+            imu=True,
+            odometry=odometry,
+        )
+        for odometry in (False, True)
+    )
+    assert without == tuple(fault for fault in with_wheels if fault.kind not in ODOMETRY_FAULTS)
+    assert len(with_wheels) > len(without)
+    conditions = odometry_conditions(with_wheels)
+    wheels = [fault for fault in with_wheels if fault.kind in ODOMETRY_FAULTS]
+    assert [condition.at_s for condition in conditions] == [fault.at_s for fault in wheels]
 
 
 def test_faults_of_the_imu_become_conditions() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,8 @@ from tsgt.config import ScenarioConfig, SimulatedImu
 from tsgt.master.replay import replayed
 from tsgt.recording import load_recording, read_lines
 from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.checks.odometry_samples import LOSS_EVENT_S, odometry_failures
+from tsgt.simulation.faults import FaultKind
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,3 +46,31 @@ def test_wheels_reach_recording_and_poses(tmp_path: Path) -> None:
     again = [line for _, some in replayed(path) for line in some]
     assert [line for line in again if line.startswith(b'{"type":"pose"')] == poses
     assert not any(line.startswith(b'{"type":"odometry"') for line in again)
+
+
+@pytest.mark.slow
+def test_silent_wheels_without_an_event_violate_the_invariant(tmp_path: Path) -> None:
+    """Silence and return are events; a recording that lacks samples, and one without the events, are noticed."""
+    scenario = ScenarioConfig(
+        pipeline=ScenarioConfig().pipeline.model_copy(update={"estimator": "linear"}),
+        imu=SimulatedImu(model="industrial"),
+        odometry=True,
+    )
+    mission = run_mission(
+        tmp_path,
+        scenario,
+        duration_s=75.0,
+        protocol=SUPERFRAME,
+        seed=5,
+        faults=frozenset({FaultKind.ODOMETRY_SILENCE}),
+    )
+    assert mission.odometry is not None
+    assert np.diff(mission.odometry.arrival_s).max() > LOSS_EVENT_S
+    assert check_invariants(mission) == []
+    (log,) = mission.master_logs
+    names = [event.event for event in log.events if event.event.startswith("odometry_")]
+    assert names[:2] == ["odometry_lost", "odometry_recovered"]
+    log.events.clear()
+    assert any("no event odometry_lost" in each for each in odometry_failures(mission))
+    shifted = replace(mission.odometry, speed_mps=mission.odometry.speed_mps + 0.1)
+    assert any("has not been given" in each for each in odometry_failures(replace(mission, odometry=shifted)))

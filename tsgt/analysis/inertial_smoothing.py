@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.estimation import centroid_m, inertial_samples, setup_jacobian, wheel_samples
+from tsgt.estimation import InertialSetupUncertainty, centroid_m, inertial_samples, wheel_samples
 from tsgt.geometry.batch import overall_scale, scale_noise
 from tsgt.geometry.inertial import fit_inertial_trajectory
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import InertialFit, InertialSamples
-    from tsgt.geometry.trajectory import Observations, SetupJacobian
+    from tsgt.geometry.trajectory import Observations
     from tsgt.model import ImuNoise, ImuSamples, OdometrySamples, Parameters
 
 MAX_GAP_S = 0.5
@@ -101,20 +101,24 @@ def fit_with_imu(
     if parameters.odometry is not None and odometry:
         wheels = wheel_samples(odometry, parameters.odometry, origin_ns), parameters.odometry
 
-    def fitted(scales: FloatArray, by_setup: SetupJacobian | None = None) -> InertialFit:
+    def fitted(
+        scales: FloatArray,
+        setup: InertialSetupUncertainty = InertialSetupUncertainty(None, None),  # noqa: B008 (constant)
+    ) -> InertialFit:
         return fit_inertial_trajectory(
             scale_noise(observations, scales),
             samples,
             imu,
             reference_m=centroid_m(parameters),
             odometry=wheels,
-            setup_jacobian=by_setup,
+            setup_jacobian=setup.setup_jacobian,
+            mounting_factor=setup.mounting_factor,
             on_progress=on_progress,
         )
 
     if not tuned:
         noise_scales = noise_scales * estimated_noise_scales(fitted(noise_scales))
-    found = fitted(noise_scales, setup_jacobian(parameters))
+    found = fitted(noise_scales, InertialSetupUncertainty.of(parameters))
     contradicted = contradicted_windows(found)
     windows = max((end_s - start_s) / WINDOW_S, 1.0)
     if len(contradicted) > MAX_CONTRADICTED * windows:

@@ -32,6 +32,7 @@ from tsgt.estimation.reference_point import (
     transform_of,
 )
 from tsgt.estimation.setup_uncertainty import (
+    InertialSetupUncertainty,
     parameter_names,
     setup_jacobian,
     stated_covariance,
@@ -53,6 +54,7 @@ __all__ = [
     "ContinuousPoseOutput",
     "Degradation",
     "ImuSetupMonitor",
+    "InertialSetupUncertainty",
     "Kind",
     "LinearEstimator",
     "LiveEstimator",

@@ -22,7 +22,7 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
-from tsgt.estimation.setup_uncertainty import setup_jacobian
+from tsgt.estimation.setup_uncertainty import InertialSetupUncertainty, setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
@@ -99,11 +99,13 @@ class ContinuousEstimator:
 
     def _create_with_imu(self) -> InertialFixedLagSmoother:
         assert self._parameters.imu is not None  # noqa: S101 (only called with one)
+        uncertainty = InertialSetupUncertainty.of(self._parameters)
         return InertialFixedLagSmoother(
             self._parameters.imu,
             self._limits.motion,
             reference_m=centroid_m(self._parameters),
-            setup_jacobian=setup_jacobian(self._parameters),
+            setup_jacobian=uncertainty.setup_jacobian,
+            mounting_factor=uncertainty.mounting_factor,
             odometry=self._parameters.odometry,
         )
 

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from tsgt.geometry.motion_calibration import INSTRUMENT_ERRORS, Setup, SetupParameters, factor_of
 from tsgt.model import SetupCovariance
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, SetupJacobian
     from tsgt.model import Matrix4, Parameters, StationParameters, Vector3
+
+
+MOUNTING_COMPONENTS = (
+    *("imu.x", "imu.y", "imu.z", "imu.rotation_x", "imu.rotation_y", "imu.rotation_z"),
+    "imu.latency",
+)
 
 
 def parameter_names(layout: SetupParameters, parameters: Parameters) -> list[str]:
@@ -28,15 +37,20 @@ def stated_covariance(layout: SetupParameters, parameters: Parameters) -> FloatA
     known = parameters.setup_covariance
     if known is None:
         return None
-    rows = {name: row for row, name in enumerate(known.components)}
-    names = parameter_names(layout, parameters)
-    ours = [i for i, name in enumerate(names) if name in rows]
-    theirs = [rows[names[i]] for i in ours]
-    covariance = np.zeros((layout.count, layout.count))
-    covariance[np.ix_(ours, ours)] = np.array(known.matrix)[np.ix_(theirs, theirs)]
+    covariance = _of_components(known, parameter_names(layout, parameters))
     to_pivot = layout.from_station_origins()
     result: FloatArray = to_pivot @ covariance @ to_pivot.T
     return result
+
+
+def _of_components(known: SetupCovariance, names: Sequence[str]) -> FloatArray:
+    """(N, N) covariance of components; those that are not stated are exact."""
+    rows = {name: row for row, name in enumerate(known.components)}
+    ours = [i for i, name in enumerate(names) if name in rows]
+    theirs = [rows[names[i]] for i in ours]
+    covariance = np.zeros((len(names), len(names)))
+    covariance[np.ix_(ours, ours)] = np.array(known.matrix)[np.ix_(theirs, theirs)]
+    return covariance
 
 
 def setup_jacobian(parameters: Parameters) -> SetupJacobian | None:
@@ -55,6 +69,34 @@ def setup_jacobian(parameters: Parameters) -> SetupJacobian | None:
         return by_setup
 
     return jacobian
+
+
+class InertialSetupUncertainty(NamedTuple):
+    """What is uncertain of the set-up with an IMU, in the columns of a factor of the joint covariance; None: unknown."""
+
+    setup_jacobian: SetupJacobian | None
+    mounting_factor: FloatArray | None  # (7, r), as of the estimators with an IMU
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> InertialSetupUncertainty:
+        """Return that of the parameters. What they omit is exact, as are the gyro's matrix and sigmas of the noise."""
+        known = parameters.setup_covariance
+        if known is None:
+            return cls(None, None)
+        layout = uncertain_setup(parameters)
+        count = layout.count
+        covariance = _of_components(known, [*parameter_names(layout, parameters), *MOUNTING_COMPONENTS])
+        to_pivot = np.eye(len(covariance))
+        to_pivot[:count, :count] = layout.from_station_origins()
+        factor = factor_of(to_pivot @ covariance @ to_pivot.T)
+
+        def jacobian(observations: Observations, linearised: LinearisedMeasurements) -> FloatArray:
+            by_setup: FloatArray = (
+                layout.jacobian(observations, linearised, layout.reference) @ factor[:count]
+            )
+            return by_setup
+
+        return cls(jacobian, factor[count:])
 
 
 class PointUncertainty:
@@ -120,9 +162,14 @@ def with_setup(
     )
     to_origins = np.linalg.inv(layout.from_station_origins())
     at_origins = to_origins @ covariance @ to_origins.T
+    names = parameter_names(layout, parameters)
+    if parameters.setup_covariance is not None:
+        # What was not estimated is known as before.
+        others = [each for each in parameters.setup_covariance.components if each.startswith("imu.")]
+        names += others
+        at_origins = block_diag(at_origins, _of_components(parameters.setup_covariance, others))
     free = np.flatnonzero(np.diag(at_origins) > 0)
     matrix = 0.5 * (at_origins + at_origins.T)[np.ix_(free, free)]
-    names = parameter_names(layout, parameters)
     known = SetupCovariance(
         components=tuple(names[i] for i in free), matrix=tuple(map(tuple, matrix.tolist()))
     )

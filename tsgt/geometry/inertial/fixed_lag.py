@@ -29,7 +29,7 @@ from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
-from tsgt.geometry.inertial.sensitivity import InertialSensitivity, Linearised
+from tsgt.geometry.inertial.sensitivity import InertialSensitivity, Linearised, by_mounting, of_gyro_alone
 from tsgt.geometry.inertial.smoother import estimation_noise
 from tsgt.geometry.inertial.solver import (
     MAX_BIAS_ROTATION_RAD,
@@ -108,6 +108,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         *,
         reference_m: FloatArray,
         setup_jacobian: SetupJacobian | None = None,
+        mounting_factor: FloatArray | None = None,
         gyro_only: bool = False,
         odometry: OdometryParameters | None = None,
     ) -> None:
@@ -132,8 +133,13 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._window: _Window | None = None
         self._solved: _Solved | None = None
         self._sensitivity: InertialSensitivity | None = None
+        if gyro_only and mounting_factor is not None:
+            mounting_factor = of_gyro_alone(mounting_factor)
         if setup_jacobian is not None:
-            self._sensitivity = InertialSensitivity(setup_jacobian, self._mounting, gyro_only=gyro_only)
+            self._sensitivity = InertialSensitivity(
+                setup_jacobian, self._mounting, gyro_only=gyro_only, mounting_factor=mounting_factor
+            )
+        self._mounting_factor = mounting_factor
         self._anchor_displacement: FloatArray | None = None
         self._displacement: tuple[FloatArray, FloatArray] | None = None
         self._trajectory: WindowTrajectory | None = None
@@ -280,6 +286,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
                     cross_covariance[:, motion, motion],
                     self._gyro_only,
                     None if displacement is None else displacement[0][:, motion],
+                    self._mounting_factor,
                 ),
                 self._predict,
                 self._predicted_common,
@@ -305,7 +312,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
         displacement = self._window_displacement()
         assert displacement is not None  # noqa: S101 (only called where the set-up is uncertain)
         newest = np.concatenate([displacement[0][-1], displacement[1]])
-        displaced = self._predictor.by_start(time_s, self._samples, self._odometry)[:dim] @ newest
+        displaced = self._predictor.by_start(time_s, self._samples, self._odometry) @ newest
+        if self._mounting_factor is not None:
+            state, _ = self._predictor.at(time_s, self._samples, self._odometry)
+            displaced += by_mounting(state, self._mounting)[0] @ self._mounting_factor
+        displaced = displaced[:dim]
         covariance: FloatArray = (displaced @ displaced.T)[None]
         return covariance
 
@@ -500,6 +511,8 @@ class InertialFixedLagSmoother(MeasurementWindow):
         for row in np.flatnonzero(old_s[nearest] != times_s).tolist():
             _propagate(guess, row, factors, self._gravity, self._gyro_only)
         self._stale_from_s = np.inf
+        if factors.odometry is not None:
+            factors = replace(factors, odometry=factors.odometry.with_slip(guess.wheels[:, 1]))
         return _Window(guess, factors, samples.at(times_s), window.anchor, samples)
 
     def _factors_of(

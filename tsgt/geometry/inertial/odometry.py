@@ -7,7 +7,7 @@ is robust: wheels that spin contradict the IMU. docs/explanation/imu.md derives 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +28,9 @@ MIN_COVERED = (
 )
 MIN_SIGMA_M = 1e-4  # Of the displacement along over a step: what the integration leaves out
 SCALE_WALK, DIRECTION_WALK = 1e-4, 1e-4  # Random walks in 1/sqrt(s) and rad/sqrt(s): load, tyres, ground
+LARGE_SLIP_SIGMAS = 2.0
+"""Estimated slip above which its noise is larger than configured, so that it is as many sigmas of that."""
+
 _TOUCHING = 0.5  # Samples that are closer than this share of their duration follow each other
 
 
@@ -69,7 +72,9 @@ class OdometrySteps:
     whitening: FloatArray  # (K, 3, 3) of the displacement's error; zero where nothing was measured
     arm_m: FloatArray  # (3,) the wheels' point, from the origin of the states in the axes of the IMU
     kept: FloatArray  # (K, 3) share of scale, slip and direction that lasts over the step
-    variances: FloatArray  # (K, 3) of what comes to them
+    variances: FloatArray  # (K, 3) of what comes to them, where slip is as configured
+    slip_sigma: float  # As configured
+    slip_noise: FloatArray  # (K,) factor on the variance of what comes to slip: 1 unless it is large
 
     def __len__(self) -> int:
         return len(self.forward_m)
@@ -83,6 +88,8 @@ class OdometrySteps:
             self.arm_m,
             self.kept[rows],
             self.variances[rows],
+            self.slip_sigma,
+            self.slip_noise[rows],
         )
 
     def joined(self, others: OdometrySteps) -> OdometrySteps:
@@ -94,7 +101,23 @@ class OdometrySteps:
             self.arm_m,
             np.concatenate([self.kept, others.kept]),
             np.concatenate([self.variances, others.variances]),
+            self.slip_sigma,
+            np.concatenate([self.slip_noise, others.slip_noise]),
         )
+
+    def with_slip(self, slip: FloatArray) -> OdometrySteps:
+        """Return the steps with as much noise of slip as its estimates at their ends, (K + 1,), show.
+
+        Wheels that spin or slide for seconds would otherwise pass for another scale, which stays when they are over.
+        """
+        level = np.maximum(np.abs(slip[:-1]), np.abs(slip[1:])) / (LARGE_SLIP_SIGMAS * self.slip_sigma)
+        return replace(self, slip_noise=np.maximum(level, 1.0) ** 2)
+
+    def process_variances(self) -> FloatArray:
+        """(K, 3) of what comes to scale, slip and direction."""
+        variances = self.variances.copy()
+        variances[:, 1] *= self.slip_noise
+        return variances
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +184,16 @@ class Odometry:
         kept[:, 1] = np.exp(-duration_s / parameters.slip_correlation_time_s)
         gained[:, 0], gained[:, 2] = SCALE_WALK**2 * duration_s, DIRECTION_WALK**2 * duration_s
         gained[:, 1] = parameters.slip_sigma**2 * (1.0 - kept[:, 1] ** 2)
-        return OdometrySteps(forward, leftward, whitening, self.arm_m, kept, gained)
+        return OdometrySteps(
+            forward,
+            leftward,
+            whitening,
+            self.arm_m,
+            kept,
+            gained,
+            parameters.slip_sigma,
+            np.ones(len(start_s)),
+        )
 
     def _pieces(
         self, start_s: FloatArray, end_s: FloatArray
@@ -219,9 +251,11 @@ def covered_steps(steps: OdometrySteps) -> NDArray[np.bool_]:
     return covered
 
 
-def rejected_steps(residuals: FloatArray) -> NDArray[np.bool_]:
-    """(K,) whether steps contradict the states, by their whitened residuals, (K, 3): they have hardly any weight."""
-    return dot(residuals, residuals) > OUTLIER_THRESHOLD**2
+def rejected_steps(knots: InertialStates, steps: OdometrySteps) -> NDArray[np.bool_]:
+    """(K - 1,) whether steps contradict the states: they have hardly any weight, or their slip is beyond all that was configured."""
+    residuals = linearise_odometry(knots, steps)[:, :, -1]
+    large = np.abs(knots.wheels[:, 1]) > OUTLIER_THRESHOLD * steps.slip_sigma
+    return (dot(residuals, residuals) > OUTLIER_THRESHOLD**2) | large[:-1] | large[1:]
 
 
 def linearise_odometry(knots: InertialStates, steps: OdometrySteps, *, shared_dim: int = 0) -> FloatArray:
@@ -255,7 +289,7 @@ def add_wheel_processes(
 ) -> float:
     """Add the processes of scale, slip and direction, (K, 3), in place; return the sum of squared Mahalanobis distances."""
     own = slice(diagonal.shape[-1] - WHEELS_DIM, diagonal.shape[-1])
-    information = 1.0 / steps.variances
+    information = 1.0 / steps.process_variances()
     error = wheels[1:] - steps.kept * wheels[:-1]
     weighted = information * error
     np.einsum("kii->ki", diagonal[:-1, own, own])[...] += steps.kept**2 * information

@@ -106,7 +106,7 @@ class StrapdownPredictor:
         first = int(np.searchsorted(knots.time_s[:-1], from_s))
         last, covered = knots.select(slice(first, None)), steps.select(slice(first, None))
         known = covered_steps(covered)
-        rejected = rejected_steps(linearise_odometry(last, covered)[:, :, -1])
+        rejected = rejected_steps(last, covered)
         step_s = np.diff(last.time_s)
         beyond = [
             (link.time_s - before.time_s, link.wheels_rejected)
@@ -205,7 +205,8 @@ class StrapdownPredictor:
         """Predict with wheel odometry over the step: the update of a Kalman filter, whose measurement both its ends enter."""
         wheels, size = slice(INERTIAL_STATE_DIM, moved.dim), moved.dim
         np.einsum("ii->i", by_link)[wheels] = steps.kept[0]
-        np.einsum("ii->i", noise)[wheels] += steps.variances[0]
+        steps = steps.with_slip(np.repeat(link.state.wheels[0, 1], 2))
+        np.einsum("ii->i", noise)[wheels] += steps.process_variances()[0]
         moved = replace(moved, wheels=steps.kept * link.state.wheels)
         rows = linearise_odometry(concatenate_inertial_states([link.state, moved]), steps)[0]
         covariance = by_link @ link.covariance @ by_link.T + noise
@@ -223,12 +224,14 @@ class StrapdownPredictor:
             return _Link(moved, link.gravity, covariance, by_start, wheels_rejected=True)
         error = -gain @ residual
         covariance -= gain @ mixed.T
+        moved = moved.retract(error[None, :size])
+        slips = bool(np.abs(moved.wheels[0, 1]) > OUTLIER_THRESHOLD * steps.slip_sigma)
         return _Link(
-            moved.retract(error[None, :size]),
+            moved,
             link.gravity.retract(error[size:]),
             0.5 * (covariance + covariance.T),
             by_start - gain @ by_both @ link.by_start,
-            wheels_rejected=False if known else None,
+            wheels_rejected=slips if known else None,
         )
 
     def _integrated(

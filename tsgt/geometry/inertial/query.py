@@ -14,6 +14,7 @@ import numpy as np
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.inertial.preintegration import Preintegrated, preintegrate
+from tsgt.geometry.inertial.sensitivity import by_mounting
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM
 from tsgt.geometry.rigid import (
     IDENTITY,
@@ -94,6 +95,8 @@ class InertialTrajectory:
     gyro_only: MotionPrior | None = None
     # (K, 15, r) displacement of the knots by what is uncertain of the set-up, which all states share; None: unknown
     displacement: FloatArray | None = None
+    # (7, r) errors of the mounting in the same columns (sensitivity.MOUNTING_DIM); None: it is exact
+    mounting_factor: FloatArray | None = None
 
     def at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
         """Return states of the reference point and of the robot's axes at N times, and the (N, 6, 6) covariance of their poses.
@@ -149,10 +152,14 @@ class InertialTrajectory:
             )
         by_error = self._to_reference(rotation)
         by_earlier, by_later = by_error @ by_earlier, by_error @ by_later
+        rate = self.samples.at(time_s)[0] - earlier.gyro_bias
+        states = self._reference_states(time_s, position, rotation, velocity, acceleration, rate)
         covariance = by_common = np.zeros((len(time_s), 0, 0))
         if common:
             assert self.displacement is not None  # noqa: S101 (the caller checks)
             displaced = by_earlier @ self.displacement[knot] + by_later @ self.displacement[knot + 1]
+            if self.mounting_factor is not None:
+                displaced += by_mounting(states, self.mounting) @ self.mounting_factor
             by_common = displaced @ np.swapaxes(displaced, 1, 2)
         if random:
             coupling = by_earlier @ self.cross_covariance[knot] @ np.swapaxes(by_later, 1, 2)
@@ -164,8 +171,6 @@ class InertialTrajectory:
                 + by_error @ noise @ np.swapaxes(by_error, 1, 2)
             )
             covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
-        rate = self.samples.at(time_s)[0] - earlier.gyro_bias
-        states = self._reference_states(time_s, position, rotation, velocity, acceleration, rate)
         return states, covariance, by_common
 
     def _inertial(

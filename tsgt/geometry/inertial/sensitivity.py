@@ -13,6 +13,7 @@ import numpy as np
 
 from tsgt.geometry.inertial.factors import by_inertial_states
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM
+from tsgt.geometry.rigid import IDENTITY, skew
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,7 +23,12 @@ if TYPE_CHECKING:
     from tsgt.geometry.inertial.solver import InertialSolution
     from tsgt.geometry.inertial.states import Mounting
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, SetupJacobian
+    from tsgt.geometry.trajectory import LinearisedMeasurements, Observations, SetupJacobian, States
+
+MOUNTING_DIM = 7
+"""Errors of the IMU's mounting: position of its origin in the frame of the robot, 3, m; rotation of its axes about those of the robot, 3, rad;
+latency of its samples, s.
+"""
 
 MIN_VARIANCE_SHARE = 1e-3  # Of the noise; below, the trajectory follows the measurement exactly
 
@@ -39,10 +45,21 @@ class Linearised(NamedTuple):
 
 
 class InertialSensitivity:
-    """Displacement of states and of what they share by the set-up's errors, in the columns of a factor of their covariance."""
+    """Displacement of states and of what they share by the set-up's errors, in the columns of a factor of their covariance.
 
-    def __init__(self, setup_jacobian: SetupJacobian, mounting: Mounting, *, gyro_only: bool) -> None:
+    ``mounting_factor``: (7, r) rows of that factor for the IMU, :data:`MOUNTING_DIM`; None: its mounting is exact.
+    """
+
+    def __init__(
+        self,
+        setup_jacobian: SetupJacobian,
+        mounting: Mounting,
+        *,
+        gyro_only: bool,
+        mounting_factor: FloatArray | None = None,
+    ) -> None:
         self._by_setup, self._mounting, self._gyro_only = setup_jacobian, mounting, gyro_only
+        self._factor = mounting_factor
 
     def displacement(self, solved: Linearised, factor: BorderedCholesky) -> tuple[FloatArray, FloatArray]:
         """(K, D, r) displacement of K knots, and (S, r) of what they share."""
@@ -50,6 +67,8 @@ class InertialSensitivity:
         # Prisms are uncertain along the axes of the robot.
         of_robot = replace(linearised, rotation=linearised.rotation @ self._mounting.rotation.T)
         by_setup = self._by_setup(observations, of_robot)
+        if self._factor is not None:
+            by_setup = by_setup + self._by_mounting(observations, of_robot) @ self._factor
         jacobian = _jacobian(linearised, gyro_only=self._gyro_only)
         information = np.linalg.inv(linearised.covariance(observations)) * weights[:, None, None]
         size = factor.border.shape[1]
@@ -65,10 +84,34 @@ class InertialSensitivity:
         displaced, shared_displaced = factor.solve(mixed, shared)
         return -displaced, -shared_displaced
 
+    def _by_mounting(self, observations: Observations, of_robot: LinearisedMeasurements) -> FloatArray:
+        """(M, 3, 7) Jacobian of the residuals by the errors of the mounting."""
+        by_prism = of_robot.by_point @ of_robot.rotation
+        arms = observations.layout[observations.prism] @ self._mounting.rotation.T
+        by_latency = of_robot.by_point @ of_robot.velocity_mps[:, :, None]
+        return np.concatenate([-by_prism, by_prism @ skew(arms), by_latency], axis=2)
+
     def at_last(self, solved: Linearised, factor: BorderedCholesky) -> FloatArray:
         """(D + S, r) displacement of the last knot and what all share: that of the anchor prior on it."""
         states, shared = self.displacement(solved, factor)
         return np.concatenate([states[-1], shared])
+
+
+def of_gyro_alone(mounting_factor: FloatArray) -> FloatArray:
+    """(7, r) rows for a gyro alone: the states are those of the reference point, wherever it sits."""
+    factor = mounting_factor.copy()
+    factor[:3] = 0.0
+    return factor
+
+
+def by_mounting(states: States, mounting: Mounting) -> FloatArray:
+    """(N, 6, 7) Jacobian of the errors of N poses of the reference point by those of the mounting, where states of the IMU stay."""
+    found = np.zeros((len(states), 6, MOUNTING_DIM))
+    found[:, 0:3, 0:3] = -states.rotation
+    found[:, 0:3, 3:6] = -states.rotation @ skew(mounting.position)
+    found[:, 3:6, 3:6] = -IDENTITY
+    found[:, 0:3, 6], found[:, 3:6, 6] = states.velocity, states.angular_velocity
+    return found
 
 
 def setup_displacement(
@@ -76,16 +119,18 @@ def setup_displacement(
     observations: Observations,
     mounting: Mounting,
     setup_jacobian: SetupJacobian,
+    mounting_factor: FloatArray | None = None,
 ) -> FloatArray:
     """(K, 15, r) displacement of the states of a solution by the set-up's errors.
 
-    ``observations``: that were solved, with the layout in the axes of the IMU.
+    ``observations``: that were solved, with the layout in the axes of the IMU. ``mounting_factor``: as of :class:`InertialSensitivity`.
     """
     solved = Linearised(observations, solution.linearised, solution.weights, solution.knot_index)
     gyro_only = not solution.factors.with_accelerometer
-    return InertialSensitivity(setup_jacobian, mounting, gyro_only=gyro_only).displacement(
-        solved, solution.factor
-    )[0]
+    sensitivity = InertialSensitivity(
+        setup_jacobian, mounting, gyro_only=gyro_only, mounting_factor=mounting_factor
+    )
+    return sensitivity.displacement(solved, solution.factor)[0]
 
 
 def residual_variances(

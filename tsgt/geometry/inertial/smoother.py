@@ -16,10 +16,10 @@ import numpy as np
 from tsgt.errors import GeometryError
 from tsgt.geometry.inertial.factors import InertialFactors
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading, states_on_tracks
-from tsgt.geometry.inertial.odometry import Odometry, covered_steps, linearise_odometry, rejected_steps
+from tsgt.geometry.inertial.odometry import Odometry, covered_steps, rejected_steps
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory
-from tsgt.geometry.inertial.sensitivity import residual_variances, setup_displacement
+from tsgt.geometry.inertial.sensitivity import of_gyro_alone, residual_variances, setup_displacement
 from tsgt.geometry.inertial.solver import InertialSetup, inertial_knot_times, solve_inertial
 from tsgt.geometry.inertial.states import (
     INERTIAL_STATE_DIM,
@@ -30,6 +30,7 @@ from tsgt.geometry.inertial.states import (
     concatenate_inertial_states,
 )
 from tsgt.geometry.trajectory import nearest_knots
+from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,6 +53,7 @@ ALONE_SEGMENTS = 8
 in which the robot stands needs what comes before and after.
 """
 START_GROWTH = 4.0  # Factor on the length that is solved from one start to the next, until it is a segment
+MAX_SLIP_SOLUTIONS = 3  # Each with the noise of slip by the one before
 FIRST_SEARCH_S, LONGEST_SEARCH_S = 10.0, 80.0
 """Length of measurements that the search over headings takes, doubled while they do not tell the heading."""
 
@@ -115,6 +117,7 @@ def fit_inertial_trajectory(
     gyro_only: MotionPrior | None = None,
     odometry: tuple[WheelSamples, OdometryParameters] | None = None,
     setup_jacobian: SetupJacobian | None = None,
+    mounting_factor: FloatArray | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> InertialFit:
     """Fit a trajectory to measurements of any number of prisms and to the samples of an IMU.
@@ -128,13 +131,16 @@ def fit_inertial_trajectory(
     reference_m : Origin of that layout, (3,) in the robot frame: the point whose poses the trajectory gives.
     gyro_only : Do not use the specific forces but this prior of the motion.
     odometry : Samples of the wheel odometry, and how they are used.
-    setup_jacobian : Sensitivity to the set-up's errors, for the part of the covariance that all states share.
+    setup_jacobian, mounting_factor : Sensitivity to the set-up's errors, for the part of the covariance that all states share;
+        :class:`~tsgt.geometry.inertial.sensitivity.InertialSensitivity`.
     on_progress : Called with the completed share of the work, 0 to 1.
     """
     report_progress = on_progress or (lambda _: None)
     mounting = Mounting.of(imu, reference_m)
     of_states = mounting if gyro_only is None else replace(mounting, position=np.zeros(3))
     mounted = replace(observations, layout=of_states.in_imu(observations.layout))
+    if gyro_only is not None and mounting_factor is not None:
+        mounting_factor = of_gyro_alone(mounting_factor)
     time_s = inertial_knot_times(observations.time_s)
     noise = estimation_noise(imu.noise)
     setup = InertialSetup(
@@ -175,6 +181,8 @@ def fit_inertial_trajectory(
             found=preintegrated,
         )
         found = solve_inertial(some, replace(setup, odometry=wheels), guess, gravity, factors=factors)
+        if wheels is not None:
+            found = _with_large_slip(found, some, replace(setup, odometry=wheels))
         return found, some, solved.start
 
     first = int(np.clip(np.searchsorted(edges_s, near.time_s[0], side="right") - 1, 0, count - 1))
@@ -190,7 +198,7 @@ def fit_inertial_trajectory(
             near = parts[number - 1 if number > first else number + 1].knots
         solution, some, offset = solve(edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near)
         kept = slice(ends[number] - offset, ends[number + 1] - offset)
-        parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian)
+        parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian, mounting_factor)
     ordered = [parts[number] for number in range(count)]
     if count > 1 and len(np.unique(mounted.prism)) == 1:
         ordered = []
@@ -200,7 +208,7 @@ def fit_inertial_trajectory(
             margins_s = edges_s[begin] - SEGMENT_S, edges_s[end] + SEGMENT_S
             solution, some, offset = solve(*margins_s, None, guess)
             kept = slice(ends[begin] - offset, ends[end] - offset)
-            ordered.append(_Part.of(solution, some, kept, of_states, setup_jacobian))
+            ordered.append(_Part.of(solution, some, kept, of_states, setup_jacobian, mounting_factor))
     report_progress(1.0)
     middle = ordered[len(ordered) // 2]
     trajectory = InertialTrajectory(
@@ -214,6 +222,7 @@ def fit_inertial_trajectory(
         None
         if setup_jacobian is None
         else np.concatenate([part.displacement for part in ordered if part.displacement is not None]),
+        mounting_factor,
     )
     return InertialFit(
         trajectory,
@@ -257,6 +266,7 @@ class _Part:
         kept: slice,
         mounting: Mounting,
         setup_jacobian: SetupJacobian | None,
+        mounting_factor: FloatArray | None,
     ) -> _Part:
         """Return the knots ``kept`` and their measurements."""
         motion = slice(INERTIAL_STATE_DIM)
@@ -265,7 +275,9 @@ class _Part:
         rows = slice(*np.searchsorted(solution.knot_index, (kept.start, kept.stop)))
         displacement = None
         if setup_jacobian is not None:
-            displacement = setup_displacement(solution, observations, mounting, setup_jacobian)[kept, motion]
+            displacement = setup_displacement(
+                solution, observations, mounting, setup_jacobian, mounting_factor
+            )[kept, motion]
         return cls(
             solution.knots.select(kept),
             covariance[kept],
@@ -281,14 +293,29 @@ class _Part:
         )
 
 
+def _with_large_slip(
+    found: InertialSolution, observations: Observations, setup: InertialSetup
+) -> InertialSolution:
+    """Solve again where the wheels slip far more than configured, with as much noise of slip as that shows."""
+    for _ in range(MAX_SLIP_SOLUTIONS):
+        steps, slip = found.factors.odometry, found.knots.wheels[:, 1]
+        assert steps is not None  # noqa: S101 (there is odometry)
+        if np.abs(slip).max() < OUTLIER_THRESHOLD * steps.slip_sigma:
+            break
+        factors = replace(found.factors, odometry=steps.with_slip(slip))
+        found = solve_inertial(observations, setup, found.knots, found.gravity, factors=factors)
+    return found
+
+
 def _wheels(solution: InertialSolution, covariance: FloatArray, kept: slice) -> WheelsFit | None:
     """Wheel odometry at the knots ``kept`` and on the steps after them; ``covariance``: (K, D, D) of all knots."""
     steps = solution.factors.odometry
     if steps is None:
         return None
-    residuals = linearise_odometry(solution.knots, steps)[kept, :, -1]
     variances = np.diagonal(covariance, axis1=1, axis2=2)[kept, INERTIAL_STATE_DIM:]
-    return WheelsFit(np.sqrt(variances), covered_steps(steps)[kept], rejected_steps(residuals))
+    return WheelsFit(
+        np.sqrt(variances), covered_steps(steps)[kept], rejected_steps(solution.knots, steps)[kept]
+    )
 
 
 def find_start(

@@ -265,7 +265,11 @@ class _Search:
         moved = knots.gyro_bias[:-1] - found.gyro_bias
         if not (np.sqrt(dot(moved, moved)) * found.duration_s > MAX_BIAS_ROTATION_RAD).any():
             return factors
-        return self.setup.factors(knots)
+        again = self.setup.factors(knots)
+        if factors.odometry is not None and again.odometry is not None:
+            odometry = replace(again.odometry, slip_noise=factors.odometry.slip_noise)
+            return replace(again, odometry=odometry)
+        return again
 
 
 def _factorise(system: InertialEquations) -> BorderedCholesky:

@@ -125,6 +125,56 @@ def test_a_step_without_samples_says_nothing() -> None:
     np.testing.assert_array_equal(linearise_odometry(states, steps)[1:3], 0.0)
 
 
+def test_large_slip_is_noisy() -> None:
+    """Its noise keeps it at two sigmas; that of scale and direction stays, as do steps with the slip that was configured."""
+    odometry, states, samples = turning(1.0)
+    steps = steps_of(odometry, states, samples)
+    sigma = PARAMETERS.slip_sigma
+    found = steps.with_slip(sigma * np.array([0.0, 1.9, 6.0, -3.0, 0.0]))
+    np.testing.assert_allclose(found.slip_noise, [1.0, 9.0, 9.0, 2.25])
+    ratio = found.process_variances() / steps.process_variances()
+    np.testing.assert_allclose(ratio[:, 1], found.slip_noise)
+    np.testing.assert_array_equal(ratio[:, [0, 2]], 1.0)
+    np.testing.assert_array_equal(found.with_slip(np.zeros(5)).slip_noise, 1.0)
+
+
+@pytest.mark.slow
+def test_wheels_that_slide_do_not_change_the_scale() -> None:
+    """Post-processed and live, six seconds 30 % too slow; the robot has stood until shortly before."""
+    imu = imu_parameters()
+    drive = inertial_drive(31.0, seed=12)
+    samples, observations = drive.samples(imu), drive.measure()
+    position, rotation = drive.pose_at(np.arange(0.0, 31.0, 0.05))
+    moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
+    end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
+    sliding = np.where((end_s > 22.0) & (end_s < 28.0), 0.7, 0.99)
+    wheels = WheelSamples(end_s, np.full(len(end_s), 0.05), sliding * moved / 0.05)
+    odometry = wheels, OdometryParameters()
+    fit = fit_inertial_trajectory(observations, samples, imu, reference_m=np.zeros(3), odometry=odometry)
+    assert fit.wheels is not None
+    knots = fit.trajectory.knots
+    inside = (knots.time_s > 23.0) & (knots.time_s < 27.0)
+    assert fit.wheels.rejected[inside[:-1]].mean() > 0.9
+    assert fit.wheels.rejected[~inside[:-1]].mean() < 0.3
+    np.testing.assert_array_less(np.abs(knots.wheels[:, 0] - 0.01), 2.5 * fit.wheels.sigmas[:, 0])
+
+    window = InertialFixedLagSmoother(
+        imu, MotionPrior(), reference_m=np.zeros(3), odometry=OdometryParameters()
+    )
+    for now_s in np.arange(0.5, 30.5, 0.5):
+        window.add_samples(samples.select((samples.end_s <= now_s) & (samples.end_s > now_s - 0.5)))
+        window.add_odometry(wheels.select((end_s <= now_s - 0.1) & (end_s > now_s - 0.6)))
+        measured = (observations.time_s <= now_s - 0.3) & (observations.time_s > now_s - 0.8)
+        if measured.any():
+            window.update(observations.select(measured))
+        window.marginalise_before(now_s - 3.0)
+        if now_s == 26.5:
+            assert window.wheels is not None
+            assert (window.wheels.rejected_share or 0.0) > 0.8
+    assert window.wheels is not None
+    assert abs(window.wheels.values[0] - 0.01) < 2.5 * window.wheels.sigmas[0]
+
+
 @pytest.mark.slow
 def test_outage_with_odometry() -> None:
     """Fourteen seconds without measurements: wheels with 2 % of scale do no harm although they spin for two seconds."""

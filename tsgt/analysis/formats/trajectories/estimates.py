@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 from tsgt.analysis.formats.bag import is_bag
 from tsgt.analysis.formats.trajectories.bag_files import read_bag
 from tsgt.analysis.formats.trajectories.raw import estimate_of
+from tsgt.analysis.formats.trajectories.reference_files import is_recording
 from tsgt.analysis.formats.trajectories.text_files import read_text
+from tsgt.errors import InputFileError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,6 +55,10 @@ def read_estimates(
                 path=path,
             )
             for topic, kind, raw in found
+        )
+    if is_recording(path):
+        raise InputFileError(
+            "holds JSON, as a recording does; export its poses: tsgt export FILE --output FILE.tum", path=path
         )
     raw = read_text(path, text_format=text_format, times=times)
     return (estimate_of(raw, name=name, source=str(path), path=path),)

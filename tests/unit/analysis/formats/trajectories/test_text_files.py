@@ -180,6 +180,7 @@ def test_rows_without_numbers_are_left_out_with_a_note(tmp_path: Path) -> None:
         ("1 0 0 0 0 0 0 1\n1e999999 0 0 0 0 0 0 1\n", 2, "no number of this century"),
         ("1 0 0 0 3 4 5 6\n2 0 0 0 3 4 5 6\n", 1, "the quaternion has length 9.27"),
         ("1 2 3 4 5\n6 7 8 9 10\n", 1, "has 5 columns, which is no pose"),
+        ('{"type":"recording"}\n', None, "holds JSON, as a recording does"),
         ("a,b,c\n1,2,3\n", 1, "do not name a pose; expected time, x, y, z"),
         ("t,x,y,z,qx\n1,2,3\n", 2, "has 3 columns where the header names 5"),
         ("t,x,y,z,valid\n1,2,3,4,maybe\n", 2, "valid is neither 0 nor 1"),

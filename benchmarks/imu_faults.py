@@ -1,13 +1,12 @@
-"""Missions with faults of the robot's IMU at random instants: no valid pose may be wrong, nor worse than without the IMU.
+"""Missions with faults of the robot's IMU at random instants: no valid pose may be wrong.
 
-    python benchmarks/run.py imu_faults [--seeds N] [--first SEED] [--duration SECONDS] [--faults all|losses] [--stations 1 2 3]
+    python benchmarks/run.py imu_faults [--seeds N] [--first SEED] [--duration SECONDS] [--stations 1 2 3]
 
-A mission is simulated once, with faults of radio, instruments and prisms in every other one; the IMU is simulated with faults of its
-own, and the live estimator runs alone, ten poses a second. That takes a tenth of a whole mission (the benchmark soak), which
-replays it too. The IMU is industrial or consumer, the protocol superframe or classic, and the number of stations one of those
-given, by the seed. A valid pose is wrong as in `tsgt simulate`: NEES above 60, and 20 mm or 0.02 rad off. With losses (silence,
-dropouts, late bursts) the same measurements without the IMU are estimated too; both are compared within 5 s of a loss
-or a return. Adds up missions, hours and faults by kind.
+A mission is simulated once, with faults of radio, instruments and prisms in every other one; the IMU is simulated with faults of
+its own, and the live estimator runs alone, ten poses a second: less than a whole mission (the benchmark soak), which replays it
+too. The IMU is industrial or consumer, the protocol superframe or classic, and the number of stations one of those given, by the
+seed. A valid pose is wrong as in `tsgt simulate`: NEES above 60, and 20 mm or 0.02 rad off. Adds up missions, hours and faults by
+kind.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.imu_faults import Drive, Poses
+from harness.imu_faults import Drive
 
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging
@@ -36,7 +35,6 @@ from tsgt.simulation.faults import (
 if TYPE_CHECKING:
     from tsgt.config import ImuModelName
 
-LOSSES = frozenset({FaultKind.IMU_SILENCE, FaultKind.IMU_DROPOUT, FaultKind.IMU_LATE_BURST})
 OTHERS = frozenset(
     map(
         FaultKind,
@@ -44,7 +42,6 @@ OTHERS = frozenset(
     )
 )
 END_S = 5.0  # Without new faults before the end
-NEAR_S = 5.0  # Of a loss or a return
 
 
 def drive(folder: Path, seed: int, duration_s: float) -> tuple[Drive, str]:
@@ -66,24 +63,6 @@ def drive(folder: Path, seed: int, duration_s: float) -> tuple[Drive, str]:
     return found, f"{model}, {'classic' if classic else 'superframe'}, {count} other faults"
 
 
-def compared(time_s: float, found: Poses, other: Poses, times_s: list[float]) -> str:
-    """Compare predicted poses near instants with and without the IMU, of those that are valid with it."""
-    near = found.predicted & found.valid & np.isin(found.time_s, other.time_s[other.predicted & other.valid])
-    near &= np.abs(found.time_s[:, None] - times_s).min(axis=1, initial=np.inf) < time_s
-    row = np.searchsorted(other.time_s[other.predicted], found.time_s[near])
-    without = other.select(other.predicted).select(row)  # type: ignore[arg-type]
-    with_imu = found.select(near)
-    if not len(row):
-        return "no poses to compare"
-    worse = (with_imu.position_m > without.position_m + 0.02) & (with_imu.nees > 22.5)
-    figures = [
-        f"{1e3 * np.sqrt(np.mean(each.position_m**2)):.1f} mm, p99 {1e3 * np.quantile(each.position_m, 0.99):.0f}, "
-        f"NEES {each.nees.mean():.1f}, above 22.5 {(each.nees > 22.5).sum()}"
-        for each in (with_imu, without)
-    ]
-    return f"{len(row)} poses near losses: {figures[0]}; without IMU {figures[1]}; worse by 20 mm and above 22.5: {worse.sum()}"
-
-
 def main() -> int:
     """Run the missions."""
     parser = argparse.ArgumentParser(
@@ -92,11 +71,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--duration", type=float, default=120.0)
-    parser.add_argument("--faults", choices=["all", "losses"], default="all")
     parser.add_argument("--stations", type=int, nargs="+", default=[3, 2, 3, 1])
     arguments = parser.parse_args()
     configure_logging("critical")
-    kinds = LOSSES if arguments.faults == "losses" else IMU_FAULTS
     counts: Counter[str] = Counter()
     uses: Counter[str] = Counter()
     simulated_s = wrong = poses = 0.0
@@ -108,7 +85,7 @@ def main() -> int:
             rng = np.random.default_rng([seed, 0x1F])
             ends_s = mission.result.duration_s
             faults = draw_faults(
-                kinds, rng, duration_s=ends_s + FAULT_FREE_TAIL_S - END_S, stations=[], imu=True
+                IMU_FAULTS, rng, duration_s=ends_s + FAULT_FREE_TAIL_S - END_S, stations=[], imu=True
             )
             found = mission.poses(mission.samples(imu_conditions(faults)), stations=stations)
         counts.update(str(fault.kind) for fault in faults)
@@ -126,11 +103,6 @@ def main() -> int:
                 + ", ".join(f"{fault.kind} {fault.at_s:.2f}+{fault.duration_s:.2f}" for fault in faults),
                 flush=True,
             )
-        if arguments.faults == "losses":
-            times_s = [each for fault in faults for each in (fault.at_s, fault.at_s + fault.duration_s)]
-            other = mission.poses([], stations=stations) if stations == 3 else None
-            if other is not None and times_s:
-                print(f"     {compared(NEAR_S, found, other, times_s)}", flush=True)
     print(
         f"{arguments.seeds} missions, {simulated_s / 3600:.2f} h, {poses:.0f} valid poses, {wrong:.0f} wrong; predicted poses by use of "
         f"the IMU: {', '.join(f'{use} {count}' for use, count in uses.most_common())}"

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tsgt.analysis.compare import Comparison
 
+OVERCONFIDENT = 2.0  # Times the expected NEES, above which it is a remark
+
 
 def notes(each: Comparison) -> list[str]:
     """Return what limits the figures of a comparison, a sentence each."""
@@ -29,6 +31,12 @@ def notes(each: Comparison) -> list[str]:
         lines.append(
             f"the extrinsic is not fitted: with it the error falls from {own:.1f} to {fair.ate.errors.position_mm.rms:.1f} mm; "
             "use `--fit offset,extrinsic`, or `--extrinsic FILE`"
+        )
+    nees = each.errors.nees
+    if nees is not None and nees.statistics.mean > OVERCONFIDENT * nees.degrees_of_freedom:
+        factor = nees.statistics.mean / nees.degrees_of_freedom
+        lines.append(
+            f"its covariance is too small: squared errors are {factor:.1f} times what it states (NEES)"
         )
     if each.errors.drift.shortened and each.errors.drift.segments:
         longest = each.errors.drift.segments[-1].length_m

@@ -67,7 +67,7 @@ def _side_by_side(found: Sequence[Comparison]) -> Section:
                 each.name,
                 (a.errors.n, 0),
                 *((value, 1) for value in (p.rms, e.position_rms_mm, p.median, p.max)),
-                *((value, 3) for value in (r.rms, e.orientation_rms_deg, r.max)),
+                *((value, 3) for value in (r.rms, e.orientation_rms_deg)),
                 (each.fully_aligned.ate.errors.position_mm.rms, 1),
                 (each.fully_aligned.ate.errors.orientation_deg.rms, 3),
             )
@@ -77,7 +77,7 @@ def _side_by_side(found: Sequence[Comparison]) -> Section:
         "with everything aligned",
         (
             *("estimate", "poses", "rms (mm)", "explained (mm)", "median (mm)", "max (mm)"),
-            *("rms (deg)", "explained (deg)", "max (deg)", "all aligned (mm)", "all aligned (deg)"),
+            *("rms (deg)", "explained (deg)", "all aligned (mm)", "all aligned (deg)"),
         ),
         tuple(rows),
     )
@@ -161,7 +161,11 @@ def _relations(found: Sequence[Comparison]) -> Section:
 
 def _with_sigma(value: float, sigma: float, digits: int) -> str:
     text = format_number(float(value), digits)
-    return f"{text} ± {format_number(sigma, digits)}" if math.isfinite(sigma) else text
+    return (
+        f"{text}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{format_number(sigma, digits)}"
+        if math.isfinite(sigma)
+        else text
+    )
 
 
 def _hidden(found: Sequence[Comparison]) -> Section:

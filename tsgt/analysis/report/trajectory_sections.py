@@ -177,6 +177,7 @@ def _alignment_and_stops(f: Findings) -> list[Table]:
                 name,
                 *(
                     (a.position_rms_mm, 1),
+                    (a.centroid.position_rms_mm, 1),
                     (a.orientation_rms_deg, 3),
                     (a.translation_mm, 1),
                     (a.rotation_deg, 3),

@@ -14,6 +14,7 @@ pytest.importorskip("matplotlib")
 from tsgt.analysis.evaluation import (
     Reference,
     compare,
+    compare_aligned,
     error_components,
     error_details,
     pose_components,
@@ -81,6 +82,19 @@ def test_tables_have_the_numbers_of_the_json() -> None:
     assert [row[0] for row in relative.rows] == ["continuous, 1 m", "continuous, 10 m", "continuous, 1 s"]
     assert "the robot's origin" in absolute.caption
     assert [plot.name for plot in section.plots] == ["reference_errors"]
+
+
+def test_aligned_errors_fill_their_table() -> None:
+    """Each column has a cell: at the pose's point and at the centroid."""
+    poses, truth = drive()
+    f = findings(poses, truth)
+    f.aligned_errors = {"continuous": compare_aligned(poses, truth, CENTROID_M, "rigid")}
+    section = reference_section(f, AXIS)
+    assert section is not None
+    (aligned,) = (each for each in section.tables if "Aligned" in each.caption)
+    (row,) = aligned.rows
+    assert len(row) == len(aligned.header)
+    assert row[2] == f"{f.aligned_errors['continuous'].centroid.position_rms_mm:.1f}"
 
 
 def test_reference_of_another_time_is_said() -> None:

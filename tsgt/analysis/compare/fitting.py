@@ -43,12 +43,10 @@ if TYPE_CHECKING:
     from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
     from tsgt.geometry import FloatArray
 
-    _Used = tuple[Rows, NDArray[np.bool_], NDArray[np.bool_]]
-    """All poses that are paired; which poses of the estimate were used, (M,); and which of the rows, (N,)."""
-
 MIN_STEP_S = 0.04
-MAX_ROWS = 15_000
-"""Poses of an estimate that a fit uses: at 25 Hz what its errors share outweighs what more poses add."""
+MAX_ROWS = 8_000
+"""Poses of an estimate that clock and extrinsic are fitted to, at most at 25 Hz: the reference's own errors are correlated over ten
+times as long. The frame is aligned, and outliers are told, by all poses."""
 
 NOISE_PASSES = 3
 MAX_ITERATIONS = 20
@@ -65,6 +63,7 @@ WEAK_AGAINST_PRIOR = 2.0  # Sigma of the motion to that of the prior, above whic
 OUTLIER_SQUARE = 40.0  # Squared Mahalanobis distance of three components
 LOST_SQUARE = 60.0  # Of a step of drift
 MAX_LOST_SHARE = 0.6
+MIN_GOOD = 3
 IN_BAND = 1.5
 """Power of errors of the reference relative to white noise of their correlation time: a first-order Gauss-Markov process has 2 at
 rest, and 1 at the 0.3 Hz at which robots rock."""
@@ -106,6 +105,8 @@ class _Joint:
     active: list[int]
     covariance: FloatArray  # (P, P)
     unobservable: tuple[str, ...]
+    every: Rows  # All poses that are paired
+    good: NDArray[np.bool_]  # of these, those that are no outliers
 
 
 def fit(
@@ -118,8 +119,7 @@ def fit(
     """
     start = initial_relation() if start is None else start
     trajectory = ReferenceTrajectory(reference)
-    joint = _fit_jointly(trajectory, estimate, settings, start)
-    return _applied(joint, _used(joint, estimate), settings, start)
+    return _applied(_fit_jointly(trajectory, estimate, settings, start), estimate, settings, start)
 
 
 def nested_fits(
@@ -143,13 +143,13 @@ def nested_fits(
     ]
     parts: set[FittedPart] = set()
     found: list[tuple[FitSettings, Fit]] = []
-    joints: dict[frozenset[FittedPart], tuple[_Joint, _Used]] = {}
+    joints: dict[frozenset[FittedPart], _Joint] = {}
     for added, align in steps:
         if not added <= settings.parts:
             continue
         parts |= added
         own = replace(settings, parts=frozenset(parts), align=align if "frame" in parts else "none")
-        if not own.parts:
+        if not parts:
             prior = settings.extrinsic_prior
             given = start if prior is None else replace(start, T_point_sensor=prior.T_point_sensor)
             used = trajectory.covers(on_reference_clock(estimate, given))
@@ -157,9 +157,8 @@ def nested_fits(
             continue
         key = own.parts & {"offset", "skew", "scale"}
         if key not in joints:
-            joint = _fit_jointly(trajectory, estimate, own, start)
-            joints[key] = joint, _used(joint, estimate)
-        found.append((own, _applied(*joints[key], own, start)))
+            joints[key] = _fit_jointly(trajectory, estimate, own, start)
+        found.append((own, _applied(joints[key], estimate, own, start)))
     return found
 
 
@@ -196,9 +195,9 @@ def _fit_jointly(
         trajectory, rows, unknowns, noise, active, T_prior, prior_terms, tolerance_sigmas=CONVERGED_SIGMAS
     )
     covariance = _covariance(solved, rows)
-    return _Joint(
-        trajectory, rows, unknowns, noise, active, covariance, tuple(NAMES[i] for i in sorted(unobservable))
-    )
+    every, good = _good_poses(trajectory, estimate, rows, unknowns, noise)
+    names = tuple(NAMES[i] for i in sorted(unobservable))
+    return _Joint(trajectory, rows, unknowns, noise, active, covariance, names, every, good)
 
 
 def _initial(
@@ -222,8 +221,7 @@ def _initial(
 
 
 def _frame_of_positions(trajectory: ReferenceTrajectory, rows: Rows, begun: Unknowns) -> FloatArray:
-    correction_ns = np.rint(1e9 * (begun.offset_s + begun.skew * rows.since_first_s)).astype(np.int64)
-    motion = trajectory.motion_at(rows.stamp_ns + correction_ns)
+    motion = trajectory.motion_at(_stamp_ns(rows, begun))
     own, target = rows.position_m[motion.known], motion.position_m[motion.known]
     own, target = own - np.median(own, axis=0), target - np.median(target, axis=0)
     spread = np.linalg.svd(own.T @ target, compute_uv=False)
@@ -434,7 +432,7 @@ def _covariance(solved: Solved, rows: Rows) -> FloatArray:
     return np.asarray(model * wider[:, None] * wider)
 
 
-def _applied(joint: _Joint, found: _Used, settings: FitSettings, start: Relation) -> Fit:
+def _applied(joint: _Joint, estimate: Estimate, settings: FitSettings, start: Relation) -> Fit:
     """Return the relation with the parts asked for, and the frame by its alignment."""
     unknowns = joint.unknowns
     prior = settings.extrinsic_prior
@@ -455,9 +453,10 @@ def _applied(joint: _Joint, found: _Used, settings: FitSettings, start: Relation
     unobservable = tuple(
         n for n in joint.unobservable if not n.startswith("extrinsic") or "extrinsic" in settings.parts
     )
-    rows, used, good = found
+    used = np.zeros(len(estimate.stamp_ns), dtype=np.bool_)
+    used[joint.every.row[joint.good]] = True
     if "frame" in settings.parts and settings.align != "none":
-        relation, by_unknowns, own, determined = _with_frame(joint, rows, good, settings.align, relation)
+        relation, by_unknowns, own, determined = _with_frame(joint, settings.align, relation)
         cross = by_unknowns[:, stated] @ covariance
         own = own + cross @ by_unknowns[:, stated].T
         covariance = np.block([[covariance, cross.T], [cross, own]])
@@ -467,38 +466,34 @@ def _applied(joint: _Joint, found: _Used, settings: FitSettings, start: Relation
     return Fit(relation, names, covariance, unobservable, used)
 
 
-def _used(joint: _Joint, estimate: Estimate) -> _Used:
-    """Return all poses that are paired, of the estimate a mask of the used ones, (M,), and of the rows, (N,)."""
-    relation = Relation(joint.unknowns.offset_s, joint.unknowns.skew, np.eye(4), np.eye(4), 1.0)
-    rows = all_rows(estimate, joint.rows, joint.trajectory.covers(on_reference_clock(estimate, relation)))
-    linear = linearise(joint.trajectory, rows, joint.unknowns)
-    covariance = own_covariance(joint.trajectory, _stamp_ns(rows, joint.unknowns), linear.known)
-    has_orientation = rows.rotation is not None
+def _good_poses(
+    trajectory: ReferenceTrajectory, estimate: Estimate, rows: Rows, unknowns: Unknowns, noise: Noise
+) -> tuple[Rows, NDArray[np.bool_]]:
+    """Return all poses that are paired, and of these which are no outliers, (N,)."""
+    relation = Relation(unknowns.offset_s, unknowns.skew, np.eye(4), np.eye(4), 1.0)
+    every = all_rows(estimate, rows, trajectory.covers(on_reference_clock(estimate, relation)))
+    linear = linearise(trajectory, every, unknowns)
+    covariance = own_covariance(trajectory, _stamp_ns(every, unknowns), linear.known)
     whitening = whiten(
-        linear.pose, joint.noise.white, covariance, linear.arm_m, has_orientation=has_orientation
+        linear.pose, noise.white, covariance, linear.arm_m, has_orientation=rows.rotation is not None
     )
-    lost = _steps_lost(joint.trajectory, rows, joint.unknowns, joint.noise)
-    good = linear.known & (whitening.square <= OUTLIER_SQUARE) & ~lost[rows.interval]
-    if np.count_nonzero(good) < 3:
-        good = linear.known.copy()
-    used = np.zeros(len(estimate.stamp_ns), dtype=np.bool_)
-    used[rows.row[good]] = True
-    return rows, used, good
+    lost = _steps_lost(trajectory, rows, unknowns, noise)
+    good = linear.known & (whitening.square <= OUTLIER_SQUARE) & ~lost[every.interval]
+    return every, good if np.count_nonzero(good) >= MIN_GOOD else linear.known
 
 
 def _with_frame(
-    joint: _Joint, rows: Rows, good: NDArray[np.bool_], align: Alignment, relation: Relation
+    joint: _Joint, align: Alignment, relation: Relation
 ) -> tuple[Relation, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return the relation with its frame, the frame's derivative by the unknowns, (6, 9), its own covariance, what it fits."""
-    correction_ns = 1e9 * (relation.offset_s + relation.skew * rows.since_first_s)
-    motion = joint.trajectory.motion_at(rows.stamp_ns + np.rint(correction_ns).astype(np.int64))
+    rows = joint.every
+    stamp_ns = _stamp_ns(rows, joint.unknowns)
+    motion = joint.trajectory.motion_at(stamp_ns)
     sensor = motion.transform @ relation.T_point_sensor
-    good = good & motion.known
+    good = joint.good & motion.known
     own_m = relation.scale * rows.position_m
     frame = align_frame(align, rows, own_m, sensor, np.ones(len(own_m)), good)
-    covariance = own_covariance(
-        joint.trajectory, rows.stamp_ns + np.rint(correction_ns).astype(np.int64), motion.known
-    )
+    covariance = own_covariance(joint.trajectory, stamp_ns, motion.known)
     if covariance is not None:
         arms = rotate(motion.rotation, relation.T_point_sensor[:3, 3])
         variance = np.einsum("nii->n", at_sensor(covariance, arms)[:, :3, :3])

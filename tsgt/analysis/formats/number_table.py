@@ -32,7 +32,7 @@ UNIT_NAMES: Final[dict[TimeUnit, str]] = {
 }
 
 _PLAIN = re.compile(r"[0-9]+(?:\.[0-9]*)?", re.ASCII)
-_NUMBER = re.compile(r"[-+]?(?:[0-9.]|nan|inf)", re.ASCII | re.IGNORECASE)
+_NUMBER = re.compile(r"[-+]?(?:[0-9.]|(?:nan|inf)$)", re.ASCII | re.IGNORECASE)
 
 # Unix times of 1973 to 5138 by unit: the same number cannot be one of another unit.
 _ABSOLUTE: tuple[tuple[float, TimeUnit], ...] = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
@@ -51,7 +51,6 @@ class NumberTable:
     columns: list[tuple[str, ...]]  # C columns of M cells
     header_line: int | None  # None: the names stand in a comment
     line: list[int]  # (M,) line of each row
-    comments: list[tuple[int, str]]  # Line and text of each comment
     separated: bool  # By commas or semicolons
 
     def numbers(self, *columns: int) -> FloatArray:
@@ -93,7 +92,7 @@ def read_number_table(path: Path) -> NumberTable:
         raise InputFileError("is not a text file", path=path) from error
     names: list[str] | None = None
     header_line: int | None = None
-    comments: list[tuple[int, str]] = []
+    comment = ""
     rows: list[list[str]] = []
     numbers: list[int] = []
     separator: str | None = None
@@ -102,7 +101,7 @@ def read_number_table(path: Path) -> NumberTable:
         if not line:
             continue
         if line[0] in "#%":
-            comments.append((number, line))
+            comment = comment if rows else line
             continue
         if not rows:
             separator = "," if "," in line else ";" if ";" in line else None
@@ -124,14 +123,13 @@ def read_number_table(path: Path) -> NumberTable:
     if len(columns) > 1 and not any(columns[-1]) and (names is None or len(names) < len(columns)):
         del columns[-1]  # every line ends with a comma
     if names is None:
-        before = [text for number, text in comments if number < numbers[0]]
-        stated = _cells(before[-1].lstrip("#% "), separator) if before else []
+        stated = _cells(comment.lstrip("#% "), separator)
         names = stated if len(stated) == len(columns) else None
     elif len(names) != len(columns):
         raise InputFileError(
             f"has {len(columns)} columns where the header names {len(names)}", path=path, line=numbers[0]
         )
-    return NumberTable(path, names, columns, header_line, numbers, comments, separator is not None)
+    return NumberTable(path, names, columns, header_line, numbers, separator is not None)
 
 
 def _cells(line: str, separator: str | None) -> list[str]:

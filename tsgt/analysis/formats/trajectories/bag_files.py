@@ -114,7 +114,7 @@ def _trajectory(reader: AnyReader, topic: str, kind: str, path: Path) -> RawTraj
         raise InputFileError(f"has no messages on {topic}", path=path)
     if kind == PATH:
         return _path(messages, topic, path)
-    stamp_ns, numbers, flags, _ = decode_messages(messages, LAYOUTS[kind])
+    stamp_ns, numbers, flags = decode_messages(messages, LAYOUTS[kind])
     notes: tuple[str, ...] = ()
     if not stamp_ns.any():
         stamp_ns = np.array(recorded, dtype=np.int64)

@@ -56,18 +56,17 @@ LAYOUTS = {
 
 def decode_messages(
     messages: Sequence[bytes], layout: Layout
-) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int8], tuple[str, ...]]:
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int8]]:
     """Decode messages of one type.
 
-    Returns stamps, (M,); the doubles, (M, K); the first byte after the names, (M,); the names of the last message. Raises
-    ValueError or struct.error for bytes that are no such message.
+    Returns stamps, (M,); the doubles, (M, K); the first byte after the names, (M,). Raises ValueError or struct.error for
+    bytes that are no such message.
     """
     stamps, parts, flags = [], [], bytearray()
-    names: tuple[str, ...] = ()
     size = _DOUBLE * layout.doubles
     for data in messages:
         check_encoding(data)
-        stamp_ns, names, end = stamped_at(data, _ENCAPSULATION, layout.names)
+        stamp_ns, _, end = stamped_at(data, _ENCAPSULATION, layout.names)
         start = _aligned(end + layout.bytes_between, _DOUBLE)
         part = data[start : start + size]
         if len(part) != size:
@@ -76,7 +75,7 @@ def decode_messages(
         parts.append(part)
         flags.append(data[end])
     numbers = np.frombuffer(b"".join(parts), dtype="<f8").reshape(-1, layout.doubles)
-    return np.array(stamps, dtype=np.int64), numbers, np.frombuffer(flags, dtype=np.int8), names
+    return np.array(stamps, dtype=np.int64), numbers, np.frombuffer(flags, dtype=np.int8)
 
 
 def decode_transforms(data: bytes) -> Iterator[tuple[int, tuple[str, ...], bytes]]:

@@ -86,13 +86,15 @@ def test_kitti_without_times_names_the_files(tmp_path: Path) -> None:
         "time_s,position_x,position_y,position_z,orientation_x,orientation_y,orientation_z,orientation_w",
         "Stamp [s];X;Y;Z;q_x;q_y;q_z;q_w",
         "header.stamp,position.x,position.y,position.z,orientation.x,orientation.y,orientation.z,orientation.w",
+        "info,t,x,y,z,qx,qy,qz,qw",
         "t x y z qx qy qz qw",
     ],
 )
 def test_csv_columns_by_name(tmp_path: Path, names: str) -> None:
     """Column names as programs write them, with commas, semicolons or blanks."""
     separator = ";" if ";" in names else "," if "," in names else " "
-    lines = [separator.join([seconds(t), *map(repr, (*p, *q))]) for t, p, q in POSES.rows()]
+    first = ["7"] if names.startswith("info") else []
+    lines = [separator.join([*first, seconds(t), *map(repr, (*p, *q))]) for t, p, q in POSES.rows()]
     check_equal(read(tmp_path / "a.csv", "\n".join([names, *lines])))
 
 

@@ -87,10 +87,14 @@ def condition_items(condition: InstrumentCondition) -> dict[ConditionKind, int]:
     return {
         ConditionKind.STATE: activity << len(PROBLEMS) | _problem_bits(condition.problem or ""),
         ConditionKind.BATTERY: 0 if battery is None else min(max(battery, 0), 100) + 1,
-        ConditionKind.ATMOSPHERE: (
-            0 if ppm is None else min(max(round(ppm * _PPM_STEPS) + _PPM_ZERO, 1), _MAX_VALUE)
-        ),
+        ConditionKind.ATMOSPHERE: 0 if ppm is None else _ppm_code(ppm),
     }
+
+
+def _ppm_code(ppm: float) -> int:
+    """Limit before rounding: a bridge program may report any finite number."""
+    most = (_MAX_VALUE - _PPM_ZERO) / _PPM_STEPS
+    return round(min(max(ppm, -most), most) * _PPM_STEPS) + _PPM_ZERO
 
 
 def _problem_bits(text: str) -> int:

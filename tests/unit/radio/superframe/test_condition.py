@@ -43,7 +43,7 @@ def received(condition: InstrumentCondition) -> InstrumentCondition:
 conditions = st.builds(
     InstrumentCondition,
     battery_percent=st.none() | st.integers(0, 100),
-    atmospheric_ppm=st.none() | st.floats(-10_000, 10_000),
+    atmospheric_ppm=st.none() | st.floats(-200, 200) | st.floats(allow_nan=False, allow_infinity=False),
     activity=st.none() | st.sampled_from([words for words, _ in ACTIVITIES]) | st.text(),
     problem=st.none() | st.sampled_from([words for words, _ in PROBLEMS]) | st.text(),
 )

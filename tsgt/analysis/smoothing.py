@@ -62,6 +62,8 @@ _POSE_DIM = 6
 
 MIN_PRISMS = 3  # Without an IMU
 
+TWO_PRISMS = 2  # Measured for a minute they tell what a single prism does not: the rotation of the IMU, but about their line
+
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
@@ -141,8 +143,13 @@ def smooth_recording(
     imu, problem = None, ""
     if parameters.imu is not None and not recording.imu_samples:
         problem = "the recording has no samples of it"
-    if with_imu and complete:
+    if with_imu and (complete or len(parameters.prisms) == TWO_PRISMS):
         problem = wrong_imu_setup(parameters, measurements, recording.imu_samples)
+        if problem and not complete:
+            raise RecordingError(
+                f"{problem}; without three stations there are no poses without it: correct its set-up (--imu-setup)",
+                path=path,
+            )
     if with_imu and not problem:
         try:
             imu = fit_with_imu(

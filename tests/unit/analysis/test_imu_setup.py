@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import pytest
 from harness.imu_calibration import (
@@ -12,8 +13,14 @@ from harness.imu_calibration import (
     point_measurements,
     uncalibrated_drive,
 )
+from harness.imu_recording import imu_recording, shaken_drive
 
 from tsgt.analysis.imu_setup import wrong_imu_setup
+from tsgt.analysis.smoothing import smooth_recording
+from tsgt.errors import RecordingError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @pytest.mark.slow
@@ -25,6 +32,18 @@ def test_wrong_setup_is_named() -> None:
     assert wrong_imu_setup(parameters_of(drive, imu), measurements, samples) == ""
     late = parameters_of(drive, replace(imu, latency_ns=imu.latency_ns + 10_000_000))
     assert "the latency of the IMU is wrong" in wrong_imu_setup(late, measurements, samples)
+
+
+@pytest.mark.slow
+def test_two_stations_with_a_wrong_setup_give_no_poses(tmp_path: Path) -> None:
+    """Without three there are none without the IMU, and those with it would be wrong."""
+    recording = imu_recording(shaken_drive(70.0), stations=2)
+    imu = recording.parameters.imu
+    assert imu is not None
+    assert smooth_recording(recording, path=tmp_path, refine="off").imu is not None
+    late = replace(recording.parameters, imu=replace(imu, latency_ns=imu.latency_ns + 10_000_000))
+    with pytest.raises(RecordingError, match=r"the latency of the IMU is wrong.*--imu-setup"):
+        smooth_recording(replace(recording, parameters=late), path=tmp_path, refine="off")
 
 
 def test_nothing_is_known_without_samples() -> None:

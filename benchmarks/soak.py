@@ -1,6 +1,6 @@
 """Many simulated missions with faults of all kinds, each from one seed, and what must never happen counted in all of them.
 
-    python benchmarks/run.py soak [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--imu MODEL ...] [--stations N ...] [--json FILE]
+    python benchmarks/run.py soak [--minutes M] [--first SEED] [--seeds N] [--jobs J] [--imu MODEL ...] [--odometry] [--stations N ...] [--json FILE]
 
 Protocol, estimator, losses and drifts change from seed to seed, and with them how often which faults come
 (`tsgt/simulation/faults/catalogue.py`); with an IMU the rate of the poses, their delays and
@@ -68,9 +68,12 @@ class Mission:
     rate_hz: float | None  # of the poses; None: that of the scenario
     delayed: bool  # whether there are smooth poses at a delay
     faults: frozenset[FaultKind]  # kinds that may come
+    odometry: bool = False  # whether the robot has wheels that are measured, beside the IMU
 
     @classmethod
-    def of(cls, seed: int, imu: ImuModelName = "none", stations: int = STATIONS) -> Mission:
+    def of(
+        cls, seed: int, imu: ImuModelName = "none", stations: int = STATIONS, *, odometry: bool = False
+    ) -> Mission:
         """Draw it; a quarter of the missions have the continuous estimator, which takes most of the time.
 
         With an IMU, which `linear` does not use, three quarters have it, and with few stations all.
@@ -90,6 +93,7 @@ class Mission:
             None if imu == "none" else float(rng.choice([5.0, 10.0, 20.0])),
             imu == "none" or bool(rng.random() < 0.5),
             frozenset(FaultKind if imu == "none" else _some_kinds(rng)),
+            odometry,
         )
 
     @property
@@ -102,8 +106,9 @@ class Mission:
     def command(self) -> str:
         """The command that runs it again."""
         if self.imu != "none":
+            wheels = "--odometry " if self.odometry else ""
             return (
-                f"python benchmarks/run.py soak --imu {self.imu} --stations {self.stations} "
+                f"python benchmarks/run.py soak --imu {self.imu} {wheels}--stations {self.stations} "
                 f"--first {self.seed} --seeds 1 --jobs 1"
             )
         return (
@@ -190,11 +195,11 @@ def _checked_once() -> Iterator[None]:
         imu_setup_monitor.check_recorded_setup = compute
 
 
-def run(seed: int, imu: ImuModelName = "none", stations: int = STATIONS) -> Sums:
+def run(seed: int, imu: ImuModelName = "none", stations: int = STATIONS, *, odometry: bool = False) -> Sums:
     """Run a mission and check it."""
     configure_logging("critical")
     logging.disable(logging.CRITICAL)  # asyncio's, of daemons that are killed
-    mission = Mission.of(seed, imu, stations)
+    mission = Mission.of(seed, imu, stations, odometry=odometry)
     kind = mission.kind
     sums = Sums(next_seed=seed + 1, missions=Counter({kind: 1}))
     scenario = find_scenario("dynamic")
@@ -208,7 +213,9 @@ def run(seed: int, imu: ImuModelName = "none", stations: int = STATIONS) -> Sums
     pipeline = scenario.pipeline.model_copy(update=changed)
     radio = scenario.radio.model_copy(update={"loss_probability": mission.loss})
     robot = scenario.imu.model_copy(update={"model": mission.imu})
-    scenario = scenario.model_copy(update={"pipeline": pipeline, "radio": radio, "imu": robot})
+    scenario = scenario.model_copy(
+        update={"pipeline": pipeline, "radio": radio, "imu": robot, "odometry": odometry}
+    )
     options = SimulationOptions(
         duration_s=DURATION_S,
         drift_ppm=mission.drift_ppm,
@@ -312,6 +319,7 @@ def main() -> int:
         default=[STATIONS],
         help="how many; fewer than three with an IMU (default: 3)",
     )
+    parser.add_argument("--odometry", action="store_true", help="each robot with an IMU has wheel odometry")
     parser.add_argument("--json", type=Path, help="keep the sums here, and go on from them")
     arguments = parser.parse_args()
     sums = Sums(next_seed=arguments.first)
@@ -330,7 +338,7 @@ def main() -> int:
             while len(running) < arguments.jobs and time.monotonic() < ends_s and seed != last:
                 imu = arguments.imu[seed % len(arguments.imu)]
                 stations = arguments.stations[seed // len(arguments.imu) % len(arguments.stations)]
-                running.add(pool.submit(run, seed, imu, stations))
+                running.add(pool.submit(run, seed, imu, stations, odometry=arguments.odometry))
                 seed += 1
             done, running = wait(running, return_when=FIRST_COMPLETED)
             for each in done:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
 
 from tsgt.analysis.compare.drifting_frame import (
     NAMES,
@@ -22,6 +21,7 @@ from tsgt.analysis.compare.drifting_frame import (
     solve,
     start_states,
 )
+from tsgt.analysis.compare.fit_uncertainty import fit_covariance, weak_unknowns
 from tsgt.analysis.compare.frame_alignment import FRAME_NAMES, align_frame, drift_covariance
 from tsgt.analysis.compare.initialisation import (
     estimate_motion,
@@ -51,16 +51,16 @@ times as long. The frame is aligned, and outliers are told, by all poses."""
 NOISE_PASSES = 3
 MAX_ITERATIONS = 20
 CONVEX_ITERATIONS = 4
-LOST_KNOTS, LOST_RATIO = 8, 6.0
-LOST_AT_FIRST = 1e12
+LOST_KNOTS, LOST_RATIO = (
+    8,
+    6.0,
+)  # Knots over which displacements are compared; ratio to their usual difference
+LOST_AT_FIRST = (
+    1e12  # Squared distance given to such steps, so that the first step of the fit does without them
+)
 CONVERGED_SIGMAS = 1e-3
 
-OBSERVABLE_SIGMA = dict(zip(NAMES, [0.05, 1e-3, 0.1, *[0.05] * 3, *[math.radians(1.0)] * 3], strict=True))
-"""Sigma above which the motion does not determine an unknown to any use."""
-
-WEAK_AGAINST_PRIOR = 2.0  # Sigma of the motion to that of the prior, above which the prior remains
-
-OUTLIER_SQUARE = 40.0  # Squared Mahalanobis distance of three components
+OUTLIER_SQUARE = 40.0  # Squared Mahalanobis distance of a pose
 LOST_SQUARE = 60.0  # Of a step of drift
 MAX_LOST_SHARE = 0.6
 MIN_GOOD = 3
@@ -68,18 +68,14 @@ IN_BAND = 1.5
 """Power of errors of the reference relative to white noise of their correlation time: a first-order Gauss-Markov process has 2 at
 rest, and 1 at the 0.3 Hz at which robots rock."""
 
-CORRELATION_S = 15.0
-"""Time over which errors may be correlated beyond the drift that is modelled."""
-
 
 @dataclass(frozen=True, slots=True)
 class ExtrinsicPrior:
     """Where the sensor is by CAD or by an earlier calibration."""
 
     T_point_sensor: FloatArray  # (4, 4)
-    sigma: (
-        FloatArray  # (6,) in m along, and in rad about, the axes of the reference's point; 0: known exactly
-    )
+    sigma: FloatArray
+    """(6,) in m along, and in rad about, the axes of the reference's point; 0: known exactly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +182,7 @@ def _fit_jointly(
         lost, first = _steps_lost(trajectory, rows, unknowns, noise), None
         noise = estimate_noise(trajectory, rows, unknowns, lost)
     unobservable = [i for i, name in enumerate(NAMES) if _never_observable(name, settings, rows)]
-    weak = _weak(solved, active, prior_terms) if solved is not None else []
+    weak = weak_unknowns(solved, active, prior_terms) if solved is not None else []
     if weak:
         unobservable += weak
         active = [i for i in active if i not in weak]
@@ -194,7 +190,7 @@ def _fit_jointly(
     unknowns, solved = _iterate(
         trajectory, rows, unknowns, noise, active, T_prior, prior_terms, tolerance_sigmas=CONVERGED_SIGMAS
     )
-    covariance = _covariance(solved, rows)
+    covariance = fit_covariance(solved, rows)
     every, good = _good_poses(trajectory, estimate, rows, unknowns, noise)
     names = tuple(NAMES[i] for i in sorted(unobservable))
     return _Joint(trajectory, rows, unknowns, noise, active, covariance, names, every, good)
@@ -367,24 +363,6 @@ def _walk_variance(rows: Rows, unknowns: Unknowns, noise: Noise) -> FloatArray:
     return np.asarray(noise.walk_per_s * rows.step_s[:, None] + noise.walk_per_m * driven_m)
 
 
-def _weak(solved: Solved, active: list[int], prior_weight: FloatArray) -> list[int]:
-    """Return the unknowns that the motion does not determine, the weakest first: each that goes makes others determinable."""
-    limit = np.array([OBSERVABLE_SIGMA[NAMES[i]] for i in active])
-    weight = prior_weight[active]
-    with_prior = weight > 0
-    limit[with_prior] = np.minimum(limit[with_prior], WEAK_AGAINST_PRIOR / np.sqrt(weight[with_prior]))
-    information = (solved.information - np.diag(weight)) * limit[:, None] * limit
-    remaining, weak = list(range(len(active))), []
-    while remaining:
-        values, vectors = np.linalg.eigh(information[np.ix_(remaining, remaining)])
-        variance = (vectors**2 / np.maximum(values, 1e-9)).sum(axis=1)
-        worst = int(np.argmax(variance))
-        if variance[worst] <= 1.0:
-            break
-        weak.append(active[remaining.pop(worst)])
-    return weak
-
-
 def _at_prior(unknowns: Unknowns, weak: list[int], begun: Unknowns, T_prior: FloatArray) -> Unknowns:
     names = {NAMES[i] for i in weak}
     arm_m = unknowns.arm_m.copy()
@@ -402,34 +380,6 @@ def _at_prior(unknowns: Unknowns, weak: list[int], begun: Unknowns, T_prior: Flo
         arm_m=arm_m,
         R_point_sensor=exp_so3(turned) @ begun.R_point_sensor,
     )
-
-
-def _covariance(solved: Solved, rows: Rows) -> FloatArray:
-    """Covariance of the active unknowns, (P, P): that of the model, widened where the residuals' pull is correlated beyond it.
-
-    Sandwich of the information around the covariance of the scores, whose correlation over time counts with Bartlett's
-    weights (W. K. Newey and K. D. West, 1987).
-    """
-    p = len(solved.information)
-    if not p:
-        return np.zeros((0, 0))
-    model = np.linalg.pinv(solved.information)
-    scores = solved.scores
-    lags = max(1, round(CORRELATION_S / float(np.median(rows.step_s))))
-    n = len(scores)
-    padded = np.concatenate([np.zeros((lags, p)), scores, np.zeros((lags, p))])
-    running = np.cumsum(np.concatenate([np.zeros((1, p)), padded]), axis=0)
-    sums = running[lags:] - running[:-lags]
-    # Sums over every window of this length: Bartlett's weights. Fewer independent windows than unknowns say too little.
-    meat = sums.T @ sums / lags
-    windows = n / lags
-    freedom = max(windows - p, 2.0)
-    sandwich = model @ meat @ model * max(windows / freedom, 1.0)
-    ratio = np.diag(sandwich) / np.maximum(np.diag(model), 1e-300)
-    # What few windows say of one unknown is uncertain itself: never less than the average of all, and as Student's t has it.
-    wider = np.sqrt(np.maximum(ratio, max(1.0, float(ratio.mean()))))
-    wider *= float(stats.t.ppf(stats.norm.cdf(2.0), freedom)) / 2.0
-    return np.asarray(model * wider[:, None] * wider)
 
 
 def _applied(joint: _Joint, estimate: Estimate, settings: FitSettings, start: Relation) -> Fit:

@@ -282,7 +282,8 @@ def _estimated_errors(
 
     def bound(jacobian: FloatArray) -> float:
         """Return what an error is below for certain."""
-        sigma = np.sqrt(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])
+        # What nothing tells is taken as configured: zero up to rounding, of either sign.
+        sigma = np.sqrt(max(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1], 0.0))
         return float(np.linalg.norm(jacobian @ error) + EXCLUDED_SIGMAS * sigma)
 
     findings: list[SetupFinding] = []

@@ -34,6 +34,10 @@ AlarmName = Literal[
     "imu_not_used",
     "imu_used",
     "imu_setup_wrong",
+    "odometry_lost",
+    "odometry_recovered",
+    "odometry_disagrees",
+    "odometry_agrees",
     "beacon_time_rejected",
     "link_delay_anomaly",
 ]

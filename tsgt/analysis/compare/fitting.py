@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -86,8 +86,6 @@ class FitSettings:
     align: Alignment = "start"
     extrinsic_prior: ExtrinsicPrior | None = None
     max_offset_s: float = 60.0
-    fixed: frozenset[str] = field(default_factory=frozenset)
-    """Of ``Fit.names``: extrinsic components that remain as they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +179,7 @@ def _fit_jointly(
         unknowns, solved = _iterate(trajectory, rows, unknowns, noise, active, T_prior, prior_terms, first)
         lost, first = _steps_lost(trajectory, rows, unknowns, noise), None
         noise = estimate_noise(trajectory, rows, unknowns, lost)
-    unobservable = [i for i, name in enumerate(NAMES) if _never_observable(name, settings, rows)]
+    unobservable = [i for i, name in enumerate(NAMES) if _never_observable(name, rows)]
     weak = weak_unknowns(solved, active, prior_terms) if solved is not None else []
     if weak:
         unobservable += weak
@@ -229,7 +227,7 @@ def _frame_of_positions(trajectory: ReferenceTrajectory, rows: Rows, begun: Unkn
 
 
 def _is_free(name: str, settings: FitSettings, rows: Rows) -> bool:
-    if name in settings.fixed or _never_observable(name, settings, rows):
+    if _never_observable(name, rows):
         return False
     if name.startswith("extrinsic"):
         prior = settings.extrinsic_prior
@@ -237,13 +235,9 @@ def _is_free(name: str, settings: FitSettings, rows: Rows) -> bool:
     return name.removesuffix("_s") in settings.parts
 
 
-def _never_observable(name: str, settings: FitSettings, rows: Rows) -> bool:
-    return (
-        rows.rotation is None
-        and name.startswith("extrinsic")
-        and name.endswith("_rad")
-        and name not in settings.fixed
-    )
+def _never_observable(name: str, rows: Rows) -> bool:
+    """Tell whether no motion whatever determines it: the rotation of a sensor that has positions alone."""
+    return rows.rotation is None and name.startswith("extrinsic") and name.endswith("_rad")
 
 
 def _prior_terms(settings: FitSettings, active: list[int]) -> FloatArray:

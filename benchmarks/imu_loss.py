@@ -110,7 +110,7 @@ def draw(group: str, rng: np.random.Generator, duration_s: float) -> list[Fault]
     start_s = START_S
     while start_s + INTERVAL_S[group] <= duration_s or not found:
         if len(found) % len(kinds) == 0:
-            rng.shuffle(kinds)  # type: ignore[arg-type]
+            rng.shuffle(kinds)
         kind = kinds[len(found) % len(kinds)]
         low, high = np.log(DURATIONS_S.get(kind, (1e-9, 1e-9)))
         lasts_s = float(np.exp(rng.uniform(low, high))) if kind in DURATIONS_S else 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from typing import TYPE_CHECKING
 
@@ -171,7 +172,7 @@ class FakeMachine:
         for name, text in (("frames.toml", FRAMES), ("layout.toml", LAYOUT)):
             path = self.write(name, text)
             os.utime(path, ns=(NOW_NS, NOW_NS - 2 * 3600 * 1_000_000_000))
-        self.write("radio.key", "ab" * 32 + "\n").chmod(0o600)
+        self.write("radio.key", hashlib.sha256(b"a key").hexdigest() + "\n").chmod(0o600)
         for name in ("journals", "recordings"):
             (folder / name).mkdir()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -23,7 +24,7 @@ MASTER = (CONFIGS / "master.example.toml").read_text()
 SETUP = {
     "prism_layout.example.toml": (CONFIGS / "prism_layout.example.toml").read_text(),
     "station_frames.example.toml": (CONFIGS / "station_frames.example.toml").read_text(),
-    "radio.key": "0123456789abcdef" * 4 + "\n",
+    "radio.key": hashlib.sha256(b"a key").hexdigest() + "\n",
 }
 PRISM_LINES = """point,kind,horizontal_angle_deg,zenith_angle_deg,slope_distance_m,constant_mm,x_m,y_m,z_m
 1,prism,10.0,80.0,20.0,10,,,

@@ -104,6 +104,7 @@ def test_process_uses_the_estimator_of_the_recording() -> None:
     )
 
 
+@pytest.mark.slow
 def test_order_of_arrival_does_not_matter() -> None:
     """However late a measurement arrived."""
     measurements = drive()
@@ -160,6 +161,7 @@ def test_mirrored_layout_is_named() -> None:
         smooth_recording(recording_of(drive(), replace(SCENE.parameters, prisms=mirrored)), path=PATH)
 
 
+@pytest.mark.slow
 def test_layout_of_another_robot_gives_no_poses() -> None:
     """The layout residual is decimetres; the error says so."""
     other = tuple(
@@ -179,6 +181,7 @@ def test_missing_measurements_are_rejected() -> None:
         smooth_recording(recording_of(blind), path=PATH)
 
 
+@pytest.mark.slow
 def test_origin_of_the_layout_does_not_matter() -> None:
     """With the origin metres away the poses and covariances are the same ones of another point."""
     arm = np.array([-3.0, 1.0, -1.5])

@@ -134,6 +134,7 @@ def test_prism_is_not_missing_before_its_next_measurement_can_be_late(scene: Sce
     assert (late.prism_reason == Reason.VALID).all()
 
 
+@pytest.mark.slow
 def test_measurement_that_is_later_than_the_delay_changes_the_final_pose(scene: Scene) -> None:
     """And not the pose that was sent before it arrived."""
     measurements = every(scene, 9.0)
@@ -337,6 +338,7 @@ def test_position_limit_is_judged_at_the_reference_point(scene: Scene) -> None:
     assert set(smoothed.reason[-20:].tolist()) == {Reason.UNCERTAIN}
 
 
+@pytest.mark.slow
 def test_wrong_layout_is_the_reason(scene: Scene) -> None:
     """Wrong layout is the reason."""
     wrong = tuple(

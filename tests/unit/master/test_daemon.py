@@ -106,6 +106,7 @@ async def test_repeated_measurement_is_published_once(tmp_path: Path) -> None:
     assert len(times) == len(set(times))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("authors", [False, True], ids=["ours", "authors'"])
 async def test_error_status_invalidates_the_pose(tmp_path: Path, *, authors: bool) -> None:
     """Tilt, wrong distance, too near, no prism: no valid pose, but status, measurement and event."""
@@ -149,6 +150,7 @@ async def test_restarted_station_with_another_clock_recovers(tmp_path: Path) -> 
     assert field.of(PoseRecord)[-1].valid
 
 
+@pytest.mark.slow
 async def test_clock_step_of_a_station_loses_no_measurement(tmp_path: Path) -> None:
     """Measurements are held until the next synchronisation."""
     async with field_of(tmp_path, authors=True) as field, running(field.master()):
@@ -169,6 +171,7 @@ async def test_clock_step_of_a_station_loses_no_measurement(tmp_path: Path) -> N
     assert found.stamp_ns - stepped_ns < 2000 * MS
 
 
+@pytest.mark.slow
 async def test_station_in_direct_mode_is_commanded_to_track(tmp_path: Path) -> None:
     """The first command is to track, so that no poll is taken for a command to measure a target."""
     async with field_of(tmp_path) as field:
@@ -179,6 +182,7 @@ async def test_station_in_direct_mode_is_commanded_to_track(tmp_path: Path) -> N
     assert field.of(StatusRecord)[-1].stations[0].measurements > 10
 
 
+@pytest.mark.slow
 async def test_refused_track_command_is_repeated(tmp_path: Path) -> None:
     """A station that does not track has an event, is not polled, and is used as soon as it tracks."""
     async with field_of(tmp_path) as field:
@@ -237,6 +241,7 @@ IMU = ImuConfig(
 )
 
 
+@pytest.mark.slow
 async def test_samples_of_the_imu_are_recorded_and_not_streamed(tmp_path: Path) -> None:
     """Status and events show it; its loss leaves the poses alone, and a replay skips the samples."""
     program = ImuProgram()
@@ -353,6 +358,7 @@ class _Steppable:
         return TRUE.realtime_ns() + self.ahead_ns
 
 
+@pytest.mark.slow
 async def test_interference_does_not_corrupt_measurements(tmp_path: Path) -> None:
     """Unknown packets in the pauses cost measurements, but corrupt none."""
     async with field_of(tmp_path) as field:

@@ -116,6 +116,7 @@ async def test_killed_client_loses_no_measurement(tmp_path: Path) -> None:
         assert set(air.master.received) <= set(sequences)
 
 
+@pytest.mark.slow
 async def test_restarted_computer_delivers_backlog(tmp_path: Path) -> None:
     """Measured while the master was away; timed on the clock before the restart by journalled beacons."""
     async with superframe_day(tmp_path) as (day, air):

@@ -209,6 +209,7 @@ def test_times_are_in_order_and_never_after_the_arrival(
     assert all(time <= arrived for time, arrived in zip(results.times_ns, results.arrived_ns, strict=True))
 
 
+@pytest.mark.slow
 def test_bound_contains_nearly_all_times() -> None:
     """Over many runs at most 1 % exceed it; in a single run without early fast responses dozens may."""
     random = np.random.default_rng(5)

@@ -4,6 +4,7 @@ import asyncio
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
+import pytest
 from harness.web import HELLO, SETUP_LINE, in_real_time, pose, status
 from structlog.testing import capture_logs
 
@@ -16,8 +17,6 @@ from tsgt.web.state import MissionState
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
-
-    import pytest
 
 LINES = (SETUP_LINE, encode_line(pose(1.0)))
 STATUS_LINE = encode_line(status(1.0))
@@ -61,6 +60,7 @@ async def shown(state: MissionState, words: str, cause: str = "") -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.slow
 @in_real_time
 async def test_master_that_comes_later_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And one that went is told as gone, not as never there."""
@@ -74,6 +74,7 @@ async def test_master_that_comes_later_is_found(tmp_path: Path, monkeypatch: pyt
         await shown(state, "STREAM STOPPED", "the stream has ended")
 
 
+@pytest.mark.slow
 @in_real_time
 async def test_line_of_a_newer_master_is_skipped(tmp_path: Path) -> None:
     """With a value that this program does not know; the log says so once."""

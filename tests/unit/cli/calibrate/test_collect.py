@@ -178,6 +178,7 @@ async def collected(
     return collection
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speaks", ["classic", "authors", "superframe"])
 async def test_collected_targets_solve_the_frames(tmp_path: Path, speaks: Speaks) -> None:
     """All stations measure all targets, the file solves to the true frames, and all stations track again."""
@@ -211,6 +212,7 @@ async def test_failed_measurement_is_reported_and_requested_again(tmp_path: Path
     assert collection.count(1, 1) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speaks", BOTH)
 async def test_station_without_response_is_named(tmp_path: Path, speaks: Speaks) -> None:
     """The session continues; at the end the station is reported as possibly not tracking."""

@@ -241,6 +241,7 @@ def test_report_without_stationary_interval(tmp_path: Path) -> None:
     drawn(found, tmp_path, "distances", "distances_over_time")
 
 
+@pytest.mark.slow
 def test_report_of_a_stationary_robot(tmp_path: Path) -> None:
     """Its errors are plotted against almost no motion, or not at all."""
     found = findings(recorded(tmp_path, at_rest))
@@ -248,6 +249,7 @@ def test_report_of_a_stationary_robot(tmp_path: Path) -> None:
     assert "never stationary" not in report_text(found)
 
 
+@pytest.mark.slow
 def test_report_with_a_reference_of_another_day(tmp_path: Path) -> None:
     """Both time spans are named."""
     reference = tmp_path / "other.tum"
@@ -258,6 +260,7 @@ def test_report_with_a_reference_of_another_day(tmp_path: Path) -> None:
     assert report_numbers(found)["compared"] == 0
 
 
+@pytest.mark.slow
 def test_odometry_defines_the_stationary_intervals(tmp_path: Path) -> None:
     """Stationary distances come from its intervals."""
     odometry = tmp_path / "odometry.csv"

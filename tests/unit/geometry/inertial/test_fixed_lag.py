@@ -238,6 +238,7 @@ def test_backlog_and_an_outage_at_once() -> None:
         assert np.abs(knots_s - time_s).min() <= 0.0101
 
 
+@pytest.mark.slow
 def test_start_that_fails_after_the_window_has_moved_on() -> None:
     """Every sixth measurement of the only prism is wrong: no start, and no error though the search reaches back further."""
     observations = measurements(1)

@@ -43,6 +43,7 @@ def test_heading_is_found_from_nothing(stations: int, limit_deg: float) -> None:
     assert errors.max() < limit_deg * DEG
 
 
+@pytest.mark.slow
 def test_one_station_does_not_tell_the_heading_of_a_stationary_robot() -> None:
     """All headings explain the measurements of one prism at rest; two prisms tell it."""
     assert not search(1, 1.0, 11.0, still=True).determined

@@ -79,6 +79,7 @@ def only(check: SetupCheck) -> SetupFinding:
 EACH_AXIS = [2, *(pytest.param(axis, marks=pytest.mark.slow) for axis in (0, 1))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", EACH_AXIS)
 def test_mounting_one_degree_off(axis: int) -> None:
     """A degree about any axis is named with its size."""

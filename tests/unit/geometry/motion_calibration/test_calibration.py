@@ -67,6 +67,7 @@ def calibration_error(
     return *normalised_error(found), missed
 
 
+@pytest.mark.slow
 def test_frame_and_latency_errors_are_recovered() -> None:
     """5 mm, 0.5 mrad and 30 ms are found to 1 mm at the robot; chi squared is in its 99.9 % band."""
     distance, unknowns, missed_m = calibration_error(with_errors(drive()), REFINE)
@@ -112,6 +113,7 @@ def test_gap_of_all_stations() -> None:
     assert found.birge_ratio < 1.5
 
 
+@pytest.mark.slow
 def test_levelled_stations_have_four_degrees_of_freedom() -> None:
     """Tilts are unchanged, and the result is as certain or better."""
     observations = drive()

@@ -54,6 +54,7 @@ def test_clean_data_are_left_alone() -> None:
     assert found.setup is found.parameters.reference
 
 
+@pytest.mark.slow
 def test_vertical_index_is_found() -> None:
     """Of one station: the most probable cause, estimated within its sigma."""
     observations = drive(60.0, seed=1)
@@ -69,6 +70,7 @@ def test_vertical_index_is_found() -> None:
     assert sigma < 1e-4
 
 
+@pytest.mark.slow
 def test_turned_tripod_is_found() -> None:
     """Station 3 turned by 0.4 mrad about its vertical after its frame was calibrated."""
     observations = drive(60.0, seed=2)

@@ -151,6 +151,7 @@ def test_inconsistent_prism_is_ambiguous_until_others_agree(observations: Observ
     assert window.ambiguous_from_s == np.inf
 
 
+@pytest.mark.slow
 def test_reinitialised_after_an_outage(observations: Observations) -> None:
     """After half a minute without measurements the smoother converges within a second."""
     later = drawn(2, 3.0)

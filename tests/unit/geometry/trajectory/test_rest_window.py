@@ -97,6 +97,7 @@ def test_predictions_keep_the_motion_prior() -> None:
     np.testing.assert_array_equal(covariance, expected_covariance)
 
 
+@pytest.mark.slow
 def test_stop_is_known_from_measurements_before_the_window() -> None:
     """A second of it in the window suffices; the history has an end."""
     observations = measure_along(start_at(0.5, 12.0), until_s=14.0, seed=5)

@@ -275,6 +275,7 @@ async def test_radio_failure_continues_the_session(tmp_path: Path) -> None:
     assert all(after.counter > before.counter for before, after in pairwise(beacons))
 
 
+@pytest.mark.slow
 async def test_killed_station_delivers_its_backlog(tmp_path: Path) -> None:
     """With correct times; skipped numbers are not waited for."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
@@ -412,6 +413,7 @@ async def test_search_commands_do_not_delay_others(tmp_path: Path) -> None:
         assert max(ages_ms[True]) < max(ages_ms[False]) + 40
 
 
+@pytest.mark.slow
 async def test_station_in_direct_mode_gets_no_search_command(tmp_path: Path) -> None:
     """Its operator aims at targets; it is commanded to track."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
@@ -438,6 +440,7 @@ async def test_refused_search_is_no_refusal_to_track(tmp_path: Path) -> None:
     assert events(field) == ["instrument_status 3"]
 
 
+@pytest.mark.slow
 async def test_expired_search_command_is_withdrawn(tmp_path: Path) -> None:
     """A station that was away gets a new one, or none."""
     link = LinkModel()

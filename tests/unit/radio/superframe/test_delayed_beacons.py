@@ -143,6 +143,7 @@ def test_inexact_reply_timestamp_enlarges_bound(off_ms: int, late_ns: int, frame
     assert timestamp_violations(loop.members[2]) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("many", [1, 4])
 @pytest.mark.parametrize(("away_s", "late_us"), [(60, 1_500), (120, 3_000), (300, 8_000)])
 def test_delayed_beacons_after_outage_are_rejected(away_s: int, late_us: int, many: int) -> None:

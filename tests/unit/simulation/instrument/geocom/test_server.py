@@ -133,6 +133,7 @@ async def test_forced_codes() -> None:
     assert [await bench.code(2008, 1, 1) for _ in range(3)] == [1293, 1293, 0]
 
 
+@pytest.mark.slow
 async def test_every_command_responds() -> None:
     """Each command with arbitrary parameters gives one well-formed response."""
     for rpc, (signature, _) in COMMANDS.items():

@@ -89,7 +89,8 @@ def _decoder(channel: dict[str, Any]) -> Callable[[bytes], dict[str, Any]]:
 
 @asynccontextmanager
 async def app(url: str, subprotocol: str = SUBPROTOCOL, **headers: str) -> AsyncIterator[App]:
-    """Connect an app; raises aiohttp.WSServerHandshakeError if it is refused."""
+    """Connect an app, like the desktop's unless headers say otherwise; raises aiohttp.WSServerHandshakeError if it is refused."""
+    headers = {name: text for name, text in {"Origin": "file://", **headers}.items() if text}
     async with (
         aiohttp.ClientSession() as session,
         session.ws_connect(url, protocols=(subprotocol,), headers=headers, max_msg_size=0) as socket,

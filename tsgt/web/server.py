@@ -247,7 +247,7 @@ class Page:
         access = self.settings.access
         origins = request.headers.getall("Origin", [])
         if access is None:
-            if len(origins) > 1 or not FOXGLOVE_ORIGINS.issuperset(origins):
+            if len(origins) != 1 or origins[0] not in FOXGLOVE_ORIGINS:
                 log.warning("foxglove_origin_rejected", origins=origins, address=request.remote)
                 raise web.HTTPForbidden
         else:

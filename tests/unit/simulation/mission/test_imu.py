@@ -193,13 +193,13 @@ def test_replay_repeats_the_checks_of_the_setup(tmp_path: Path) -> None:
 def test_live_poses_are_accurate(tmp_path: Path, count: int, rms_m: float, rms_deg: float) -> None:
     """At the time of sending, from half a minute after the start on, of the prisms' centroid."""
     scenario = with_stations(WITH.model_copy(update={"pipeline": ScenarioConfig().pipeline}), count)
-    run = run_mission(tmp_path, scenario, duration_s=75.0, protocol=SUPERFRAME, seed=0)
+    run = run_mission(tmp_path, scenario, duration_s=60.0, protocol=SUPERFRAME, seed=0)
     assert check_invariants(run) == []
     (log,) = run.master_logs
     poses = log.valid_poses()
     time_s = (poses.stamp_ns - log.unix_at_zero_ns) / 1e9
-    rows = (poses.series == "predicted") & (time_s > 30.0) & (time_s < 75.0)
-    assert np.count_nonzero(rows) > 0.99 * 20 * 45.0
+    rows = (poses.series == "predicted") & (time_s > 30.0) & (time_s < 60.0)
+    assert np.count_nonzero(rows) > 0.99 * 20 * 30.0
     truth = run.true_poses(time_s[rows])
     rotation = rotation_from_quaternion(poses.orientation_xyzw[rows])
     estimated = transform_from(rotation, poses.position_m[rows])

@@ -3,7 +3,7 @@
     python benchmarks/run.py compare [--scenarios dynamic quarry ski-trail] [--kinds lidar visual-inertial gnss]
         [--seeds 100] [--first 0] [--duration 300] [--json FILE]
 
-The reference is the truth at 20 Hz with errors of a covariance like that of processed missions, correlated over half a second.
+The reference has poses at 20 Hz and errors like those of processed missions: in sigma, correlation, and independence of its poses.
 Prints, per scenario and kind of estimate: errors of time offset (ms), lever arm (mm, largest component) and rotation of the sensor
 (deg, largest component) where observable, the share of all these within two stated sigmas, and the ratio of the position ATE after
 the fit, aligned rigidly, to that with the true relation.
@@ -13,13 +13,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from measuring import Stopwatch
-from scipy.signal import lfilter
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
 
 from tsgt.analysis.compare import Estimate, FitSettings, ReferencePoses, fit, pair
 from tsgt.geometry import covariance_over_lever_arm, exp_so3, log_so3, rotate, transform_from
@@ -31,38 +33,51 @@ from tsgt.simulation.world import scenario_world
 if TYPE_CHECKING:
     from tsgt.analysis.compare import Fit
     from tsgt.geometry import FloatArray
-    from tsgt.simulation.estimates import EstimateModel, SimulatedEstimate
+    from tsgt.simulation.estimates import EstimateModel, PoseAt, SimulatedEstimate
     from tsgt.simulation.world import World
 
 KINDS = {"lidar": LIDAR, "visual-inertial": VISUAL_INERTIAL, "gnss": GNSS}
 START_NS = 1_700_000_000_000_000_000
 MARGIN_S = 3.0
 CENTROID_M = np.array([0.0, 0.0, 1.2])
-POSITION_SIGMA_M, ROTATION_SIGMA_RAD = 0.002, 0.002
-CORRELATION_S = 0.5
+POSITION_SIGMA_M, ROTATION_SIGMA_RAD = 0.001, 0.0017
+SMOOTHING_S = (
+    0.2  # Of a Gaussian kernel: correlation 0.82 over 0.2 s, 0.21 over 0.5 s, as errors of processed drives
+)
 
 
-def reference_poses(world: World, duration_s: float, rng: np.random.Generator) -> ReferencePoses:
-    """Return the truth at 20 Hz with errors at the prisms' centroid, carried to the robot's origin."""
+def reference_and_truth(
+    world: World, duration_s: float, rng: np.random.Generator
+) -> tuple[ReferencePoses, PoseAt]:
+    """Return reference poses at 20 Hz, and the truth about them.
+
+    Errors of a smoother are independent of its poses, not of the truth: the world's motion is the reference, and the truth errs.
+    """
     time_s = np.arange(0.0, duration_s, 0.05)
     n = len(time_s)
-    true = world.pose_at(time_s)
-    kept = float(np.exp(-0.05 / CORRELATION_S))
-    white = rng.standard_normal((n, 6))
-    white[1:] *= np.sqrt(1 - kept**2)
-    error = lfilter([1.0], [1.0, -kept], white, axis=0) * np.repeat([POSITION_SIGMA_M, ROTATION_SIGMA_RAD], 3)
-    turn = exp_so3(error[:, 3:])
-    arm_m = rotate(true[:, :3, :3], CENTROID_M)
-    position = true[:, :3, 3] + arm_m + error[:, :3] - rotate(turn, arm_m)
+    motion = world.pose_at(time_s)
+    width = SMOOTHING_S / 0.05
+    white = gaussian_filter1d(rng.standard_normal((n, 6)), width, axis=0) * math.sqrt(
+        2.0 * math.sqrt(math.pi) * width
+    )
+    spline = CubicSpline(time_s, white * np.repeat([POSITION_SIGMA_M, ROTATION_SIGMA_RAD], 3))
+
+    def truth_at(at_s: FloatArray) -> FloatArray:
+        at_s = np.clip(at_s, 0.0, time_s[-1])
+        T, error = world.pose_at(at_s), spline(at_s)
+        arm_m, turn = rotate(T[:, :3, :3], CENTROID_M), exp_so3(error[:, 3:])
+        return transform_from(turn @ T[:, :3, :3], T[:, :3, 3] + arm_m + error[:, :3] - rotate(turn, arm_m))
+
     covariance = np.tile(np.diag(np.repeat([POSITION_SIGMA_M, ROTATION_SIGMA_RAD], 3) ** 2), (n, 1, 1))
-    return ReferencePoses(
+    reference = ReferencePoses(
         stamp_ns=START_NS + np.rint(time_s * 1e9).astype(np.int64),
-        T_station1_point=transform_from(turn @ true[:, :3, :3], position),
-        covariance=covariance_over_lever_arm(covariance, -arm_m),
+        T_station1_point=motion,
+        covariance=covariance_over_lever_arm(covariance, -rotate(motion[:, :3, :3], CENTROID_M)),
         covariance_common=None,
         valid=np.ones(n, dtype=np.bool_),
         point=ROBOT_ORIGIN,
     )
+    return reference, truth_at
 
 
 def simulated(
@@ -71,18 +86,11 @@ def simulated(
     """Simulate a mission: the reference, the truth, and one estimate."""
     rng = np.random.default_rng([seed, 24])
     world = scenario_world(find_scenario(scenario), duration_s, rng)
-    reference = reference_poses(world, duration_s - 0.1, rng)
-    truth = draw_relation(model, rng)
-    made = simulate_estimate(
-        model,
-        truth,
-        lambda t: world.pose_at(np.clip(t, 0.0, duration_s)),
-        duration_s - 0.2,
-        rng,
-        start_ns=START_NS,
-    )
+    reference, truth_at = reference_and_truth(world, duration_s - 0.1, rng)
+    relation = draw_relation(model, rng)
+    made = simulate_estimate(model, relation, truth_at, duration_s - 0.2, rng, start_ns=START_NS)
     time_s = (reference.stamp_ns - START_NS) / 1e9
-    exact = replace(reference, T_station1_point=world.pose_at(time_s), covariance=None)
+    exact = replace(reference, T_station1_point=truth_at(time_s), covariance=None)
     return reference, exact, made
 
 

@@ -187,23 +187,15 @@ def drift_at(rows: Rows, unknowns: Unknowns) -> tuple[FloatArray, FloatArray, Fl
     return rotation, position, arm_before, arm_after
 
 
-def linearise(
-    trajectory: ReferenceTrajectory, rows: Rows, unknowns: Unknowns, turn: FloatArray | None = None
-) -> Linearised:
-    """Residuals and their derivatives; those of rotations to first order in the residual.
-
-    ``turn``: (N, 3) error of the reference's rotation, by which the derivatives, but not the residuals, are corrected.
-    """
+def linearise(trajectory: ReferenceTrajectory, rows: Rows, unknowns: Unknowns) -> Linearised:
+    """Residuals and their derivatives; those of rotations to first order in the residual."""
     n, k = len(rows.row), len(rows.knot)
     correction_ns = 1e9 * (unknowns.offset_s + unknowns.skew * rows.since_first_s)
     motion = trajectory.motion_at(rows.stamp_ns + np.rint(correction_ns).astype(np.int64))
     rotation, position, arm_before, arm_after = drift_at(rows, unknowns)
     a = rows.share[:, None, None]
     arm_m = rotate(motion.rotation, unknowns.arm_m)
-    corrected = motion.rotation if turn is None else exp_so3(turn) @ motion.rotation
-    velocity = motion.velocity_mps + np.cross(
-        motion.angular_velocity_radps, rotate(corrected, unknowns.arm_m)
-    )
+    velocity = motion.velocity_mps + np.cross(motion.angular_velocity_radps, arm_m)
     pose, by_state, by_border = np.zeros((n, 6)), np.zeros((n, 6, 12)), np.zeros((n, 6, 9))
     pose[:, :3] = position - motion.position_m - arm_m
     eye = np.eye(3)
@@ -211,13 +203,13 @@ def linearise(
     by_state[:, :3, 6:9], by_state[:, :3, 9:12] = a * eye, -a * skew(arm_after)
     by_border[:, :3, 0] = -velocity
     by_border[:, :3, 2] = ((1 - a[:, 0]) * arm_before + a[:, 0] * arm_after) / unknowns.scale
-    by_border[:, :3, 3:6] = -corrected
+    by_border[:, :3, 3:6] = -motion.rotation
     if rows.rotation is not None:
         sensor = motion.rotation @ unknowns.R_point_sensor
         pose[:, 3:] = log_so3(rotation @ rows.rotation @ np.swapaxes(sensor, 1, 2))
         by_state[:, 3:, 3:6], by_state[:, 3:, 9:12] = (1 - a) * eye, a * eye
         by_border[:, 3:, 0] = -motion.angular_velocity_radps
-        by_border[:, 3:, 6:9] = -corrected
+        by_border[:, 3:, 6:9] = -motion.rotation
     by_border[:, :, 1] = by_border[:, :, 0] * rows.since_first_s[:, None]
     own = unknowns.scale * rows.position_m[rows.knot]
     step = np.diff(own, axis=0)

@@ -32,8 +32,7 @@ from tsgt.analysis.compare.initialisation import (
 from tsgt.analysis.compare.interpolation import ReferenceTrajectory
 from tsgt.analysis.compare.noise import estimate_noise
 from tsgt.analysis.compare.pairing import on_reference_clock
-from tsgt.analysis.compare.reference_error import CORRELATION_S as REFERENCE_CORRELATION_S
-from tsgt.analysis.compare.reference_error import at_sensor, own_covariance, whiten
+from tsgt.analysis.compare.reference_error import as_white, at_sensor, own_covariance, whiten
 from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation, initial_relation
 from tsgt.geometry import exp_so3, log_so3, rotate, transform_from
 
@@ -64,9 +63,6 @@ OUTLIER_SQUARE = 40.0  # Squared Mahalanobis distance of a pose
 LOST_SQUARE = 60.0  # Of a step of drift
 MAX_LOST_SHARE = 0.6
 MIN_GOOD = 3
-IN_BAND = 1.5
-"""Power of errors of the reference relative to white noise of their correlation time: a first-order Gauss-Markov process has 2 at
-rest, and 1 at the 0.3 Hz at which robots rock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,18 +262,16 @@ def _iterate(
     ``lost``: (K - 1,) steps of drift that must not count in the first step of a fit from initial values.
     """
     dimensions = 3 if rows.rotation is None else 6
-    covariance = _in_band(
-        own_covariance(trajectory, _stamp_ns(rows, unknowns), _known(trajectory, rows, unknowns)), rows
-    )
-    turn = None
+    covariance = own_covariance(trajectory, _stamp_ns(rows, unknowns), _known(trajectory, rows, unknowns))
+    if covariance is not None:
+        covariance = as_white(covariance, float(np.median(np.diff(rows.since_first_s))))
     for iteration in range(MAX_ITERATIONS):
         # The first step is that of least squares: from knots that follow every noisy pose to a smooth drift.
         convex = lost is not None and iteration < CONVEX_ITERATIONS
-        linear = linearise(trajectory, rows, unknowns, turn)
+        linear = linearise(trajectory, rows, unknowns)
         whitening = whiten(
             linear.pose, noise.white, covariance, linear.arm_m, has_orientation=rows.rotation is not None
         )
-        turn = whitening.turn
         walk_variance = _walk_variance(rows, unknowns, noise)
         walk_square = _pairwise(linear.walk**2 / walk_variance)
         if lost is not None and iteration == 0:
@@ -322,15 +316,6 @@ def _moves_otherwise(rows: Rows, unknowns: Unknowns) -> NDArray[np.bool_]:
     by_start, by_end = (rotate(unknowns.Q[each], step) for each in (before, after))
     square = ((0.5 * (by_start + by_end) - unknowns.c[after] + unknowns.c[before]) ** 2).sum(axis=1)
     return np.asarray(square > LOST_RATIO**2 * max(float(np.median(square)), 1e-12))
-
-
-def _in_band(covariance: FloatArray | None, rows: Rows) -> FloatArray | None:
-    """Inflate a covariance of errors correlated from row to row to that of white ones of equal power where robots move."""
-    if covariance is None:
-        return None
-    return covariance * max(
-        1.0, 2.0 * REFERENCE_CORRELATION_S / float(np.median(np.diff(rows.since_first_s)))
-    )
 
 
 def _pairwise(squares: FloatArray) -> FloatArray:

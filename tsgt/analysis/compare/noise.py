@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from tsgt.analysis.compare.drifting_frame import Noise, drift_at
-from tsgt.analysis.compare.reference_error import CORRELATION_S, at_sensor, own_covariance
+from tsgt.analysis.compare.reference_error import at_sensor, change_variance, own_covariance
 from tsgt.geometry import log_so3, rotate
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def estimate_noise(
                 smooth = (step_s[some] ** 2).mean() if is_rough else 0.0
                 terms.append((2.0, step_s[some].mean(), step_m[some].mean(), smooth))
                 square = np.median(difference[some] ** 2, axis=0) / MEDIAN_OF_CHI_SQUARE
-                share = 2.0 * usual * (1.0 - math.exp(-float(step_s[some].mean()) / CORRELATION_S))
+                share = usual * change_variance(float(step_s[some].mean()))
                 squares.append(np.maximum(square - share, MIN_SHARE * square))
     if len(terms) < 4:
         return Noise(

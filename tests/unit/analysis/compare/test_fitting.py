@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 from harness.compared_drive import START_NS, long_reference, reference, robot
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.compare import (
@@ -16,7 +17,15 @@ from tsgt.analysis.compare import (
     overlap_s,
     pair,
 )
-from tsgt.geometry import FloatArray, exp_so3, invert, log_so3, quaternion_from_rotation, transform_from
+from tsgt.geometry import (
+    FloatArray,
+    covariance_over_lever_arm,
+    exp_so3,
+    invert,
+    log_so3,
+    quaternion_from_rotation,
+    transform_from,
+)
 
 EXTRINSIC = transform_from(
     Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix(), np.array([0.3, -0.2, 0.8])
@@ -163,6 +172,34 @@ def test_vertical_lever_arm_is_unobservable_on_level_ground() -> None:
     )
     known = fit(flat, estimate, FitSettings(EVERYTHING, "rigid", extrinsic_prior=prior))
     assert known.relation.T_point_sensor[2, 3] == 0.75
+
+
+def test_what_a_smoother_takes_off_the_motion_does_not_bias_the_lever_arm() -> None:
+    """The truth rocks about the prisms by 8 mrad more than the reference, independently of it, as the covariance says."""
+    made = reference(60.0)
+    n, centroid_m = len(made.stamp_ns), np.array([0.0, 0.0, 1.2])
+    heading = np.arctan2(made.T_station1_point[:, 1, 0], made.T_station1_point[:, 0, 0])
+    known, missed = (exp_so3(0.008 * rocking(n, seed)) for seed in (1, 2))
+    smoothed = transform_from(
+        known @ exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0])), made.T_station1_point[:, :3, 3]
+    )
+    arm_m = smoothed[:, :3, :3] @ centroid_m
+    about_prisms_m = smoothed[:, :3, 3] + arm_m - (missed @ arm_m[:, :, None])[:, :, 0]
+    T = transform_from(missed @ smoothed[:, :3, :3], about_prisms_m)[40:-40:2] @ EXTRINSIC
+    estimate = Estimate("seen", made.stamp_ns[40:-40:2], T[:, :3, 3], None, None)
+    covariance = covariance_over_lever_arm(np.tile(np.diag([1e-6] * 3 + [64e-6] * 3), (n, 1, 1)), -arm_m)
+    found = fit(
+        dataclasses.replace(made, T_station1_point=smoothed, covariance=covariance),
+        noisy(estimate, 9),
+        FitSettings(EVERYTHING, "rigid"),
+    )
+    assert abs(found.relation.T_point_sensor[2, 3] - EXTRINSIC[2, 3]) < 0.05
+
+
+def rocking(n: int, seed: int) -> FloatArray:
+    """Return smooth random numbers of unit variance at 20 Hz, correlated over half a second, (N, 3)."""
+    found = gaussian_filter1d(np.random.default_rng(seed).normal(size=(n, 3)), 4.0, axis=0)
+    return np.asarray(found / found.std(axis=0))
 
 
 def test_extrinsic_known_exactly_stays() -> None:

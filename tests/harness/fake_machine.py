@@ -41,7 +41,7 @@ port = "dev/serial/by-id/{ADAPTER}"
 prism_type = "mini_360"
 [radio]
 kind = "sx127x"
-frequency_mhz = 869.525
+frequency_mhz = 869.85
 spreading_factor = 7
 region = "EU868"
 [protocol]

@@ -10,8 +10,10 @@ from typing import Any
 import jsonschema
 import pytest
 
-from tsgt.config import MasterConfig, ScenarioConfig, json_schema, load, load_any, parameters
+from tsgt.config import ClientConfig, MasterConfig, ScenarioConfig, json_schema, load, load_any, parameters
 from tsgt.config import scenario_parameters as si
+from tsgt.radio.legality import legality
+from tsgt.radio.planning import REGIONS
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 EXAMPLES = sorted(CONFIGS.rglob("*.toml"))
@@ -52,7 +54,15 @@ def test_master_examples_state_the_defaults(name: str) -> None:
     raw = tomllib.loads((CONFIGS / f"{name}.example.toml").read_text())
     minimal = {key: raw[key] for key in ("kind", "setup", "stations")}
     minimal["radio"] = {
-        key: raw["radio"][key] for key in ("kind", "frequency_mhz", "spreading_factor", "region")
+        key: raw["radio"][key]
+        for key in (
+            "kind",
+            "frequency_mhz",
+            "spreading_factor",
+            "bandwidth_khz",
+            "region",
+            "antenna_gain_dbi",
+        )
     }
     minimal["protocol"] = {
         key: raw["protocol"][key] for key in ("kind", "key_file") if key in raw["protocol"]
@@ -68,6 +78,32 @@ def test_every_example_gives_the_reason_for_its_protocol(path: Path) -> None:
     """There is no silent default."""
     _, given, protocol = path.read_text().partition("[protocol]\n")
     assert "because" in protocol.partition("\n[")[0] or not given
+
+
+DAEMON_EXAMPLES = sorted([*CONFIGS.glob("client*.example.toml"), *CONFIGS.glob("master*.example.toml")])
+
+
+@pytest.mark.parametrize("path", DAEMON_EXAMPLES, ids=lambda path: path.stem)
+def test_every_example_is_legal_as_shipped(path: Path) -> None:
+    """In its region, without a licence; the ones for Canada also in the USA, as their comment says."""
+    config = load_any(path)
+    assert isinstance(config, ClientConfig | MasterConfig)
+    assert config.radio.licence is None
+    regions = {"CA915": ("CA915", "US915")}.get(str(config.radio.region), (config.radio.region,))
+    for region in regions:
+        radio = config.radio.model_copy(update={"region": region})
+        found = legality(config.model_copy(update={"radio": radio}), path)
+        assert (found.violations, found.remedy, found.warning) == ((), None, None)
+
+
+def test_every_region_has_an_example() -> None:
+    """For both daemons."""
+    for kind in ("client", "master"):
+        configs = [load_any(path) for path in DAEMON_EXAMPLES if path.name.startswith(kind)]
+        regions = {
+            config.radio.region for config in configs if isinstance(config, ClientConfig | MasterConfig)
+        }
+        assert regions | {"US915"} == set(REGIONS)
 
 
 def test_commented_geofence_example_is_valid() -> None:

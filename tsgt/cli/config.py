@@ -32,7 +32,7 @@ from tsgt.config import (
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.geometry import check_layout
 from tsgt.model import MIN_PRISMS, Parameters, PrismPosition
-from tsgt.radio.from_config import lora_settings
+from tsgt.radio.legality import check_legality
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -102,7 +102,7 @@ def _problems_at_start(file: Path, content: Model) -> list[ConfigError]:
     if not isinstance(content, ScenarioConfig):
         attempt(check_permissions, file)
     if isinstance(content, ClientConfig | MasterConfig):
-        attempt(lora_settings, content.radio, file)
+        attempt(check_legality, content, file)
         attempt(radio_key, content.protocol)
     match content:
         case MasterConfig():

@@ -30,12 +30,14 @@ def client(config_path: Path) -> None:
     from tsgt.clock import SystemClock, boot_id
     from tsgt.config import ClientConfig, check_permissions, load
     from tsgt.radio.from_config import lora_settings
+    from tsgt.radio.legality import check_legality
     from tsgt.station import ClientDependencies, run_client
 
     check_permissions(config_path)
     config = load(config_path, ClientConfig)
     clock = SystemClock()
     settings = lora_settings(config.radio, config_path)
+    check_legality(config, config_path)
     key = radio_key(config.protocol)
     open_radio = radio_opener(config.radio, settings, clock)
     instrument = make_instrument(config.instrument, clock)
@@ -59,6 +61,7 @@ def master(config_path: Path) -> None:
     from tsgt.config import MasterConfig, check_permissions, load, parameters
     from tsgt.master.daemon import MasterDependencies, run_master
     from tsgt.radio.from_config import lora_settings
+    from tsgt.radio.legality import check_legality
 
     check_permissions(config_path)
     config = load(config_path, MasterConfig)
@@ -66,6 +69,7 @@ def master(config_path: Path) -> None:
     check_permissions(config.setup.prism_layout)
     in_force = parameters(config)
     settings = lora_settings(config.radio, config_path)
+    check_legality(config, config_path)
     key = radio_key(config.protocol)
     clock = SystemClock()
     open_radio = radio_opener(config.radio, settings, clock)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from tsgt.config.base import Model, Positive, RelativePath
 
@@ -27,9 +27,13 @@ class ModemConfig(Model):
     sync_word: Annotated[int, Field(ge=0, le=255)] = 0x34
     """Sync word, one byte; the authors' nodes use 0x34."""
     region: Literal["EU433", "EU868", "US915", "CA915"] | None = None
-    """Region that determines the power on this channel; a channel outside its bands is rejected."""
+    """Region whose law applies; what violates it is refused. A real radio needs a region or a licence."""
+    antenna_gain_dbi: Annotated[float, Field(ge=-40, le=40)] = 2.15
+    """Gain of the antenna, less the loss of its cable and attenuator. The default is a dipole's."""
     power_dbm: Annotated[int, Field(ge=2, le=20)] | None = None
-    """Power at the PA_BOOST pin, 2 to 17. Default: that of the region, else 2."""
+    """Power at the PA_BOOST pin, 2 to 17. Default: the most that the region allows with this antenna, else 2."""
+    licence: Annotated[str, Field(min_length=3, max_length=200)] | None = None
+    """Number or text of a radio licence. The limits of the region do not apply with one: its own do, unchecked."""
     allow_20_dbm: bool = False
     """Allow power_dbm = 20, which the chip supports at a duty cycle of 1 % only."""
 
@@ -62,6 +66,14 @@ class HardwareRadioConfig(ModemConfig):
     """A real radio."""
     wiring: WiringConfig = WiringConfig()
     """Wiring."""
+
+    @model_validator(mode="after")
+    def _law_is_known(self) -> HardwareRadioConfig:
+        if self.region is None and self.licence is None:
+            raise ValueError(
+                'a radio that transmits needs its region, such as region = "EU868", or licence = "..." elsewhere'
+            )
+        return self
 
 
 class SimulatedRadioConfig(ModemConfig):

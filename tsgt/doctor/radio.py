@@ -5,26 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tsgt.config import (
-    ClassicConfig,
-    ClassicMasterConfig,
-    HardwareRadioConfig,
-    MasterConfig,
-    SuperframeMasterConfig,
-)
+from tsgt.config import HardwareRadioConfig, MasterConfig
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.doctor.serial_line import access_hint
-from tsgt.radio.from_config import lora_settings, planned_cycle, wiring
-from tsgt.radio.planning import DIPOLE_DBI, ChannelUse, TrafficLoad, violations
+from tsgt.radio.from_config import lora_settings, wiring
+from tsgt.radio.legality import legality
 from tsgt.radio.sx127x import Chip, Register, RegisterAccess
 
 if TYPE_CHECKING:
-    from tsgt.config import ClientConfig, MasterProtocolConfig, RadioConfig
+    from tsgt.config import ClientConfig, RadioConfig
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine, User
-
-STATIONS = 3  # Assumed by a client, which does not know the number of stations
-RATE_HZ = 2.5
 
 
 def check_radio_devices(machine: Machine, config: RadioConfig, user: User) -> Finding:
@@ -88,36 +79,25 @@ async def check_radio(machine: Machine, config: RadioConfig, path: Path, *, daem
 
 def check_limits(config: ClientConfig | MasterConfig, path: Path) -> Finding:
     """Check power and duty cycle against the limits of the region and the chip."""
-    settings = lora_settings(config.radio, path)
-    stations = len(config.stations) if isinstance(config, MasterConfig) else STATIONS
-    cycle = planned_cycle(_protocol(config), TrafficLoad(stations=stations, rate_hz=RATE_HZ), settings)
-    use = ChannelUse(settings, DIPOLE_DBI, cycle.master_duty, cycle.station_duty)
-    duty = cycle.master_duty if isinstance(config, MasterConfig) else cycle.station_duty
+    found, radio = legality(config, path), config.radio
+    settings, use = found.use.settings, found.use
+    if isinstance(config, MasterConfig):
+        duty = f"{100 * use.master_duty:.0f} % with {found.stations} stations"
+    else:
+        duty = f"at least {100 * use.station_duty:.0f} %"
     text = (
         f"{settings.frequency_hz / 1e6:g} MHz, SF {settings.spreading_factor}, {settings.bandwidth_hz / 1e3:g} kHz, "
-        f"{settings.power_dbm} dBm, duty cycle {100 * duty:.0f} % with {stations} stations"
+        f"{settings.power_dbm} dBm into {radio.antenna_gain_dbi:g} dBi ({use.eirp_dbm:.1f} dBm e.i.r.p., "
+        f"{use.erp_dbm:.1f} e.r.p.), duty cycle {duty}"
     )
-    found = [sentence.partition(". Would comply")[0] for sentence in violations(use, config.radio.region, ())]
-    if found:
-        plan = (
-            f"tsgt radio plan --protocol {config.protocol.kind} --stations {stations} --sf {settings.spreading_factor} "
-            f"--bandwidth-khz {settings.bandwidth_hz / 1e3:g} --frequency-mhz {settings.frequency_hz / 1e6:g} "
-            f"--power-dbm {settings.power_dbm}"
+    if found.violations:
+        return failed(
+            "limits", f"{text}. {'; '.join(found.violations)}. Under [radio], in all radios: {found.remedy}"
         )
-        if config.radio.region is not None:
-            plan += f" --region {config.radio.region}"
-        return note("limits", f"{text}. {'; '.join(found)}. For settings that comply: `{plan}`")
-    if config.radio.region is None:
-        return note(
-            "limits", f'{text}; no region is configured, so the legal limits are unknown: region = "EU868"'
-        )
-    return ok("limits", f"{text}; within the known limits of {config.radio.region}, with a dipole")
-
-
-def _protocol(config: ClientConfig | MasterConfig) -> MasterProtocolConfig:
-    """Return the protocol settings of the master; for a client the defaults."""
-    if isinstance(config, MasterConfig):
-        return config.protocol
-    if isinstance(config.protocol, ClassicConfig):
-        return ClassicMasterConfig(kind="classic")
-    return SuperframeMasterConfig(kind="superframe")
+    if found.warning is not None:
+        return note("limits", f"{text}. {found.warning}")
+    if radio.licence is not None:
+        return note("limits", f"{text}; the licence {radio.licence!r} is stated, and its limits are unknown")
+    if radio.region is None:
+        return skipped("limits", f"{text}; nothing is transmitted, as the radio is simulated")
+    return ok("limits", f"{text}; within the limits of {radio.region}")

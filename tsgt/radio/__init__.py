@@ -2,7 +2,7 @@
 
 In: payloads and send times. Out: packets with the timestamps of their reception. `base` has the interface, `sx127x` the
 driver, `airtime` the durations on the air, `classic` and `superframe` the two protocols (sans-I/O), `planning` capacity and
-regional limits, `commands` what a master commands a station, `supervisor` reopens a failed radio, `ping` is a bench test.
+regional limits, `legality` whether a configuration keeps to them, `commands` what a master commands a station, `supervisor` reopens a failed radio, `ping` is a bench test.
 """
 
 from tsgt.radio.airtime import (

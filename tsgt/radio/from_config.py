@@ -28,7 +28,12 @@ def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:
     try:
         power_dbm = MIN_POWER_DBM if config.power_dbm is None else config.power_dbm
         if config.region is not None:
-            preset = preset_power_dbm(config.region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
+            preset = preset_power_dbm(
+                config.region,
+                frequency_hz=frequency_hz,
+                bandwidth_hz=bandwidth_hz,
+                antenna_gain_dbi=config.antenna_gain_dbi,
+            )
             power_dbm = preset if config.power_dbm is None else config.power_dbm
         if power_dbm == 20 and not config.allow_20_dbm:
             raise RadioSettingsError(

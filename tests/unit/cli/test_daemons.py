@@ -14,6 +14,8 @@ from tsgt.errors import ConfigError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from click import Command
+
 
 @pytest.mark.parametrize(
     ("daemon", "file"),
@@ -32,3 +34,16 @@ def test_daemon_rejects_world_writable_files(tmp_path: Path, daemon: str, file: 
     refused = CliRunner().invoke(command, ["--config", str(tmp_path / f"{daemon}.toml")]).exception
     assert isinstance(refused, ConfigError)
     assert f"`chmod o-w {tmp_path / file}`" in str(refused)
+
+
+@pytest.mark.parametrize(("daemon", "command"), [("client", client), ("master", master)])
+def test_daemon_refuses_illegal_settings(tmp_path: Path, daemon: str, command: Command) -> None:
+    """One line with the limit and the remedy."""
+    fake = FakeMachine(tmp_path)
+    fake.change("master.toml", "bandwidth_khz = 500.0", "bandwidth_khz = 250.0")
+    fake.change("client.toml", 'region = "EU868"', 'region = "EU868"\npower_dbm = 14')
+    arguments = ["--config", str(tmp_path / f"{daemon}.toml")]
+    refused = CliRunner().invoke(command, arguments).exception
+    assert isinstance(refused, ConfigError)
+    assert "Remedy: " in str(refused)
+    assert "\n" not in str(refused)

@@ -80,6 +80,10 @@ PROBLEMS = {
         ('kind = "sx127x"', 'kind = "sx1262"'),
         'radio.kind = "sx1262": should be one of "sx127x", "simulated"',
     ),
+    "no region": (
+        ('region = "CA915"', "#"),
+        'radio: a radio that transmits needs its region, such as region = "EU868", or licence = "..." elsewhere',
+    ),
     "no kind of table": (('kind = "sx127x"', ""), "radio.kind: missing key"),
     "missing key in a table of several kinds": (
         ("frequency_mhz = 905.0", ""),

@@ -28,7 +28,7 @@ async def test_ready_machine_has_no_failure(tmp_path: Path, name: str) -> None:
     ("old", "new", "expected"),
     [
         ("station = 1", "stationn = 1", "did you mean station?"),
-        ("frequency_mhz = 869.525", "frequency_mhz = 905.0", "not within a band of EU868"),
+        ("frequency_mhz = 869.85", "frequency_mhz = 905.0", "not within a band of EU868"),
     ],
 )
 async def test_invalid_configuration_fails_and_other_checks_run(

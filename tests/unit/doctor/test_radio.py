@@ -97,23 +97,37 @@ async def test_simulated_radio_is_skipped(tmp_path: Path) -> None:
 
 
 async def test_settings_within_limits_pass(tmp_path: Path) -> None:
-    """500 kHz in Canada, and 7 dBm with a duty cycle of 10 % in Europe."""
+    """500 kHz in Canada, and 7 dBm above 869.7 MHz in Europe; the finding has the radiated power."""
     fake = FakeMachine(tmp_path)
-    assert (await fake.run_checks("master.toml"))["limits"].outcome is Outcome.OK
+    for file, radiated in (("master.toml", "19.1 dBm e.i.r.p."), ("client.toml", "7.0 e.r.p.")):
+        found = (await fake.run_checks(file))["limits"]
+        assert found.outcome is Outcome.OK
+        assert radiated in found.detail
 
 
-async def test_exceeded_limits_are_a_note_with_the_plan_command(tmp_path: Path) -> None:
-    """The law of the country decides."""
+async def test_violation_fails_with_the_remedy(tmp_path: Path) -> None:
+    """The finding is one line; the settings in it comply."""
     fake = FakeMachine(tmp_path)
     fake.change("master.toml", "bandwidth_khz = 500.0", "bandwidth_khz = 250.0")
     found = (await fake.run_checks("master.toml"))["limits"]
-    assert found.outcome is Outcome.NOTE
-    assert "tsgt radio plan --protocol classic --stations 3 --sf 9 --bandwidth-khz 250" in found.detail
-    assert "--region CA915" in found.detail
+    assert found.outcome is Outcome.FAILED
+    assert found.detail.endswith("Under [radio], in all radios: bandwidth_khz = 500, power_dbm = 17")
+    assert "RSS-210" in found.detail
 
 
-async def test_missing_region_is_a_note(tmp_path: Path) -> None:
-    """The legal limits are unknown."""
+async def test_antenna_with_too_much_gain_fails(tmp_path: Path) -> None:
+    """The radiated power counts."""
     fake = FakeMachine(tmp_path)
-    fake.change("client.toml", 'region = "EU868"', "")
-    assert (await fake.run_checks())["limits"].outcome is Outcome.NOTE
+    fake.change("client.toml", 'region = "EU868"', 'region = "EU868"\npower_dbm = 7\nantenna_gain_dbi = 5.15')
+    found = (await fake.run_checks())["limits"]
+    assert found.outcome is Outcome.FAILED
+    assert found.detail.endswith("power_dbm = 4")
+
+
+async def test_licence_is_a_note(tmp_path: Path) -> None:
+    """Its holder knows its limits."""
+    fake = FakeMachine(tmp_path)
+    fake.change("client.toml", 'region = "EU868"', 'licence = "BAKOM 1234"\npower_dbm = 17')
+    found = (await fake.run_checks())["limits"]
+    assert found.outcome is Outcome.NOTE
+    assert "BAKOM 1234" in found.detail

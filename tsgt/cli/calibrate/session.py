@@ -14,6 +14,7 @@ from tsgt.errors import InstrumentError, RadioError, StreamError, TsgtError
 from tsgt.model import Status
 from tsgt.radio import DirectCommand, MeasureCommand, TrackCommand
 from tsgt.radio.from_config import lora_settings
+from tsgt.radio.legality import check_legality
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Mapping
@@ -150,6 +151,7 @@ async def target_session(
         The chip does not support the settings, or the key cannot be read.
     """
     settings = lora_settings(config.radio, path)
+    check_legality(config, path)
     protocol = config.protocol
     key = radio_key(protocol)
     if await _is_served(config.stream.socket):

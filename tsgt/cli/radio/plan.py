@@ -20,13 +20,16 @@ from tsgt.config import (
 )
 from tsgt.radio import LoRaSettings
 from tsgt.radio.from_config import planned_cycle
+from tsgt.radio.legality import remedy_text
 from tsgt.radio.planning import (
-    DIPOLE_DBI,
+    CHANNELS,
     MIN_POWER_DBM,
     REGIONS,
     ChannelUse,
     CycleEstimate,
     TrafficLoad,
+    chip_violation,
+    compliant_use,
     path_loss_db,
     preset_power_dbm,
     sensitivity_dbm,
@@ -41,8 +44,9 @@ if TYPE_CHECKING:
 _CLASSIC = ClassicMasterConfig(kind="classic")
 _SUPERFRAME = SuperframeMasterConfig(kind="superframe")
 
-_FREQUENCIES_MHZ = {"EU868": 869.525, "EU433": 433.92, "US915": 905.0, "CA915": 905.0}
-"""Default channel by region: in Europe the one with the highest limits, in North America the paper's."""
+_PAPER_MHZ = 905.0
+_VIOLATED = 3
+"""Exit code: a legal limit is violated."""
 
 _TABLE_STATIONS = (1, 2, 3, 4, 6, 8, 12, 16)
 _MIN_MARGIN_DB = 10.0
@@ -88,22 +92,27 @@ class _Row:
 @click.option("--loss", type=FiniteRange(0, 0.9), default=0.0, help="Probability that a packet is lost.")
 @click.option("--region", type=click.Choice(list(REGIONS)), help="Region whose legal limits apply.")
 @model_option(
-    ModemConfig, "frequency_mhz", help="Carrier frequency.  [default: a channel of the region, or 905]"
+    ModemConfig,
+    "frequency_mhz",
+    help="Carrier frequency.  [default: the channel of the region, with its bandwidth, or 905]",
 )
 @click.option(
-    "--power-dbm", type=int, help="Transmit power, 2 to 17 or 20.  [default: that of the region, or 2]"
+    "--power-dbm",
+    type=int,
+    help="Transmit power, 2 to 17 or 20.  [default: the most that the region allows, or 2]",
 )
 @click.option("--distance-m", type=FiniteRange(1, 1e6), default=1000.0, help="Distance for the link margin.")
 @model_option(ScenarioRadioConfig, "path_loss_exponent", default=3.0)
-@model_option(
-    ScenarioRadioConfig,
-    "antenna_gain_db",
-    default=DIPOLE_DBI,
-    help="Gain of each antenna less its cable loss, in dBi; a dipole has 2.15.",
-)
+@model_option(ModemConfig, "antenna_gain_dbi")
 @model_option(SuperframeMasterConfig, "start_jitter_ms")
 @model_option(SuperframeMasterConfig, "turnaround_ms")
 @click.option("--no-phase-lock", is_flag=True, help="Do not lock the frame phase to the instruments.")
+@click.option(
+    "--table",
+    "with_table",
+    is_flag=True,
+    help="Compare all spreading factors, coding rates and numbers of stations.",
+)
 @json_option
 def plan_command(
     *,
@@ -117,28 +126,40 @@ def plan_command(
     power_dbm: int | None,
     distance_m: float,
     path_loss_exponent: float,
-    antenna_gain_db: float,
+    antenna_gain_dbi: float,
     start_jitter_ms: float,
     turnaround_ms: float,
     no_phase_lock: bool,
+    with_table: bool,
     as_json: bool,
-) -> None:
+) -> int:
     """Compute rate, age, range and legality of a channel.
 
     Rate counts distinct measurements per station that reach the master. Age is the time from the client's reading to
-    the arrival at the master; add the latency of the instrument, 80 to 140 ms for a simulated one on a fast line. The
-    table shows both for other spreading factors, coding rates and numbers of stations. Frequencies, powers and limits
-    are for orientation only: check the law of the country.
+    the arrival at the master; add the latency of the instrument, 80 to 140 ms for a simulated one on a fast line.
+    Frequencies, powers and limits are for orientation only: check the law of the country.
+
+    Exit code 3: a limit of the region is violated; settings that comply follow in one line.
     """
     if stations > MAX_STATION_NUMBERS[protocol]:
         raise click.UsageError(
             f"--stations {stations}: {protocol} supports at most {MAX_STATION_NUMBERS[protocol]}"
         )
-    frequency_hz = round(1e6 * (frequency_mhz or _FREQUENCIES_MHZ.get(region or "", 905.0)))
+    if region is not None and frequency_mhz is None:
+        channel = CHANNELS[region]
+        frequency_mhz = channel.frequency_hz / 1e6
+        if _is_default("bandwidth_khz"):
+            modem = replace(modem, bandwidth_hz=channel.bandwidth_hz)
+    frequency_hz = round(1e6 * (frequency_mhz or _PAPER_MHZ))
     if power_dbm is None:
         power_dbm = MIN_POWER_DBM
         if region is not None:
-            power_dbm = preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=modem.bandwidth_hz)
+            power_dbm = preset_power_dbm(
+                region,
+                frequency_hz=frequency_hz,
+                bandwidth_hz=modem.bandwidth_hz,
+                antenna_gain_dbi=antenna_gain_dbi,
+            )
     settings = LoRaSettings(frequency_hz=frequency_hz, power_dbm=power_dbm, **asdict(modem))
     spoken: MasterProtocol = _CLASSIC
     if protocol == "superframe":
@@ -150,7 +171,7 @@ def plan_command(
             }
         )
     received_dbm = (
-        power_dbm + 2 * antenna_gain_db - path_loss_db(distance_m, frequency_hz, path_loss_exponent)
+        power_dbm + 2 * antenna_gain_dbi - path_loss_db(distance_m, frequency_hz, path_loss_exponent)
     )
 
     def row(settings: LoRaSettings, stations: int) -> _Row:
@@ -167,36 +188,54 @@ def plan_command(
         for n in numbers
     ]
     warnings = _warnings(planned, table, spoken, rate_hz=rate_hz)
-    # Longest range first, then least airtime.
-    others = sorted(
-        (
-            other
-            for other in table
-            if other.stations == stations and other.cycle.rate_hz >= _COMPLETE * rate_hz
-        ),
-        key=lambda other: (-other.margin_db, other.cycle.master_duty),
-    )
-    warnings += violations(planned.use(antenna_gain_db), region, [o.use(antenna_gain_db) for o in others])
+    use = planned.use(antenna_gain_dbi)
+    if chip := chip_violation(use):
+        warnings.append(chip)
+    violated = [] if region is None else violations(use, region)
+    remedy = None
+    if region is not None and violated:
+        compliant = compliant_use(use, region, lambda other: row(other, stations).use(antenna_gain_dbi))
+        remedy = remedy_text(use, compliant)
+    code = _VIOLATED if violated else 0
     if as_json:
         print_json(
             {
                 "protocol": protocol,
                 "stations": stations,
                 "frequency_mhz": frequency_hz / 1e6,
+                "bandwidth_khz": settings.bandwidth_hz / 1e3,
                 "power_dbm": power_dbm,
+                "antenna_gain_dbi": antenna_gain_dbi,
+                "eirp_dbm": use.eirp_dbm,
+                "erp_dbm": use.erp_dbm,
                 **_figures(planned.cycle),
                 "link_margin_db": planned.margin_db,
                 "received_dbm": received_dbm,
-                "warnings": warnings,
-                "table": [each.json() for each in table],
+                "warnings": warnings + violated,
+                "violations": violated,
+                "remedy": remedy,
+                **({"table": [each.json() for each in table]} if with_table else {}),
             }
         )
-        return
-    _print(planned, received_dbm=received_dbm, distance_m=distance_m, rate_hz=rate_hz)
+        return code
+    _print(planned, use, received_dbm=received_dbm, distance_m=distance_m, rate_hz=rate_hz)
     for warning in warnings:
         click.echo(f"warning      {warning}")
-    click.echo(f"\nRate in Hz and median age in s, by number of stations; link margin at {distance_m:g} m:\n")
-    _print_table(table, numbers)
+    for sentence in violated:
+        click.echo(f"VIOLATION    {sentence}")
+    if remedy is not None:
+        click.echo(f"remedy       {remedy}")
+    if with_table:
+        click.echo(
+            f"\nRate in Hz and median age in s, by number of stations; link margin at {distance_m:g} m:\n"
+        )
+        _print_table(table, numbers)
+    return code
+
+
+def _is_default(name: str) -> bool:
+    source = click.get_current_context().get_parameter_source(name)
+    return source is click.core.ParameterSource.DEFAULT
 
 
 def _figures(cycle: CycleEstimate) -> dict[str, Any]:
@@ -235,11 +274,15 @@ def _warnings(planned: _Row, table: Sequence[_Row], spoken: MasterProtocol, *, r
     return found
 
 
-def _print(planned: _Row, *, received_dbm: float, distance_m: float, rate_hz: float) -> None:
+def _print(planned: _Row, use: ChannelUse, *, received_dbm: float, distance_m: float, rate_hz: float) -> None:
     settings, cycle = planned.settings, planned.cycle
     click.echo(
         f"channel      {settings.frequency_hz / 1e6:g} MHz, SF {settings.spreading_factor}, "
         f"{settings.bandwidth_hz / 1e3:g} kHz, 4/{settings.coding_rate}, {settings.power_dbm} dBm"
+    )
+    click.echo(
+        f"radiated     {use.eirp_dbm:.1f} dBm e.i.r.p., {use.erp_dbm:.1f} dBm e.r.p. with an antenna of "
+        f"{use.antenna_gain_dbi:g} dBi"
     )
     click.echo(f"cycle        {cycle.cycle_ms:.0f} ms for {planned.stations} stations")
     click.echo(f"rate         {cycle.rate_hz:.2f} of {rate_hz:g} Hz per station")

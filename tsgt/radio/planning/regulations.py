@@ -1,19 +1,20 @@
-"""What may be transmitted where: power presets and limits of regions and chip, and the violations of a planned use.
+"""What may be transmitted where: limits of regions and chip, the violations of a planned use, and a use that complies.
 
 ERC/REC 70-03 and EN 300 220-2 (Europe, e.r.p.); 47 CFR 15.247 and 15.249 (USA), RSS-247 and RSS-210 (Canada); SX1276 data
-sheet. As of 2026; the local law decides. The presets assume a dipole, so that the e.r.p. is the power at the pin.
+sheet. As of 2026; the local law decides.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.errors import RadioSettingsError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator
 
     from tsgt.radio.base import LoRaSettings
 
@@ -22,6 +23,17 @@ MAX_PRESET_DBM = 17  # above it the chip has its own limit of 1 % duty cycle
 MIN_POWER_DBM = 2  # minimum of PA_BOOST
 
 WIDE_HZ = 500_000  # from this bandwidth on, a fixed channel is a digital modulation by 15.247(a)(2)
+
+DIPOLE_DBI = 2.15  # difference of e.i.r.p. and e.r.p.
+
+NARROW_EIRP_DBM = -1.25  # 15.249: 50 mV/m at 3 m, for a fixed channel of any bandwidth
+
+WIDE_DBM = 30  # 15.247(b)(3): 1 W into the antenna
+
+WIDE_GAIN_DBI = 6  # 15.247(b)(4): gain above this reduces the allowed power
+
+CHIP_DBM = 20
+CHIP_DUTY = 0.01  # duty cycle limit of the chip at +20 dBm
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,47 +44,52 @@ class Band:
     ----------
     low_hz, high_hz
         A channel may extend over adjoining bands; then the stricter limits apply.
-    power_dbm
-        Preset at the PA_BOOST pin.
     erp_dbm
-        Limit of the radiated power; None: the region limits it otherwise.
+        Limit of the radiated power; None: that of North America, which depends on the bandwidth.
     duty_cycle
         Limit within any hour; None: unlimited.
-    min_bandwidth_hz
-        Smallest bandwidth of the preset; below it the preset is :data:`MIN_POWER_DBM`.
     unlimited_duty_erp_dbm
         Power up to which the duty cycle is unlimited.
     """
 
     low_hz: int
     high_hz: int
-    power_dbm: int
     erp_dbm: float | None = None
     duty_cycle: float | None = None
-    min_bandwidth_hz: int = 0
     unlimited_duty_erp_dbm: float | None = None
 
 
-# 25 mW are 14 dBm, 10 mW are 10 dBm. On 902-928 MHz a fixed narrow channel fits no rule but 15.249, -1.25 dBm e.i.r.p.
-_NORTH_AMERICA = (Band(902_000_000, 928_000_000, MAX_PRESET_DBM, min_bandwidth_hz=WIDE_HZ),)
+# 25 mW are 14 dBm, 10 mW are 10 dBm, 1 mW is 0 dBm.
+_NORTH_AMERICA = (Band(902_000_000, 928_000_000),)
 REGIONS: dict[str, tuple[Band, ...]] = {
     "EU868": (
-        Band(863_000_000, 865_000_000, 14, 14, 0.001),
-        Band(865_000_000, 868_600_000, 14, 14, 0.01),
-        Band(868_700_000, 869_200_000, 14, 14, 0.001),
-        Band(869_400_000, 869_650_000, MAX_PRESET_DBM, 27, 0.1),
-        Band(869_700_000, 870_000_000, 14, 14, 0.01, unlimited_duty_erp_dbm=7),
+        Band(863_000_000, 865_000_000, 14, 0.001),
+        Band(865_000_000, 868_600_000, 14, 0.01),
+        Band(868_700_000, 869_200_000, 14, 0.001),
+        Band(869_400_000, 869_650_000, 27, 0.1),
+        Band(869_700_000, 870_000_000, 14, 0.01, unlimited_duty_erp_dbm=7),
     ),
-    "EU433": (Band(433_050_000, 434_790_000, 10, 10, 0.1),),
+    # At 1 mW a bandwidth above 250 kHz is limited to -13 dBm per 10 kHz as well: 4 dBm in 500 kHz.
+    "EU433": (Band(433_050_000, 434_790_000, 10, 0.1, unlimited_duty_erp_dbm=0),),
     "US915": _NORTH_AMERICA,
     "CA915": _NORTH_AMERICA,
 }
 
 
-def preset_power_dbm(region: str, *, frequency_hz: int, bandwidth_hz: int) -> int:
-    """Return the preset power at the PA_BOOST pin; raises RadioSettingsError for a channel outside the region."""
-    bands = bands_of(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
-    return min(band.power_dbm if bandwidth_hz >= band.min_bandwidth_hz else MIN_POWER_DBM for band in bands)
+class Channel(NamedTuple):
+    """Carrier frequency and bandwidth."""
+
+    frequency_hz: int
+    bandwidth_hz: int
+
+
+CHANNELS: dict[str, Channel] = {
+    "EU868": Channel(869_850_000, 250_000),
+    "EU433": Channel(433_920_000, 250_000),
+    "US915": Channel(905_000_000, WIDE_HZ),
+    "CA915": Channel(905_000_000, WIDE_HZ),
+}
+"""Default channel of a region: the one with the highest power at an unlimited duty cycle."""
 
 
 def bands_of(region: str, *, frequency_hz: int, bandwidth_hz: int) -> tuple[Band, ...]:
@@ -93,16 +110,34 @@ def bands_of(region: str, *, frequency_hz: int, bandwidth_hz: int) -> tuple[Band
     )
 
 
-DIPOLE_DBI = 2.15  # difference of e.i.r.p. and e.r.p.
+def power_limit_dbm(region: str, *, frequency_hz: int, bandwidth_hz: int, antenna_gain_dbi: float) -> float:
+    """Return the limit of the power at the antenna connector, where there is one at an unlimited duty cycle.
 
-NARROW_EIRP_DBM = -1.25  # 15.249: 50 mV/m at 3 m, for a fixed channel of any bandwidth
+    ``antenna_gain_dbi``: less the loss of the cable. Raises RadioSettingsError for a channel outside the region.
+    """
+    limits_dbm = []
+    for band in bands_of(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz):
+        if band.erp_dbm is not None:
+            erp_dbm = band.erp_dbm if band.unlimited_duty_erp_dbm is None else band.unlimited_duty_erp_dbm
+            limits_dbm.append(erp_dbm + DIPOLE_DBI - antenna_gain_dbi)
+        elif bandwidth_hz >= WIDE_HZ:
+            limits_dbm.append(WIDE_DBM - max(antenna_gain_dbi - WIDE_GAIN_DBI, 0))
+        else:
+            limits_dbm.append(NARROW_EIRP_DBM - antenna_gain_dbi)
+    return min(limits_dbm)
 
-WIDE_DBM = 30  # 15.247(b)(3): 1 W into the antenna
 
-WIDE_GAIN_DBI = 6  # 15.247(b)(4): gain above this reduces the allowed power
+def preset_power_dbm(
+    region: str, *, frequency_hz: int, bandwidth_hz: int, antenna_gain_dbi: float = DIPOLE_DBI
+) -> int:
+    """Return the largest power that the limit of :func:`power_limit_dbm` allows, within those of the chip."""
+    limit_dbm = power_limit_dbm(
+        region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz, antenna_gain_dbi=antenna_gain_dbi
+    )
+    return min(max(math.floor(limit_dbm + _ROUNDING_DB), MIN_POWER_DBM), MAX_PRESET_DBM)
 
-CHIP_DBM = 20
-CHIP_DUTY = 0.01  # duty cycle limit of the chip at +20 dBm
+
+_ROUNDING_DB = 1e-9  # of sums of gains
 
 
 class ChannelUse(NamedTuple):
@@ -127,56 +162,77 @@ class ChannelUse(NamedTuple):
         """Radiated power, relative to an isotropic antenna."""
         return self.settings.power_dbm + self.antenna_gain_dbi
 
+    @property
+    def erp_dbm(self) -> float:
+        """Radiated power, relative to a dipole."""
+        return self.eirp_dbm - DIPOLE_DBI
 
-def violations(use: ChannelUse, region: str | None, others: Sequence[ChannelUse]) -> list[str]:
-    """Return a sentence for each violated limit, with what would comply.
 
-    ``region``: None: only the chip's limits apply. ``others``: the same use with other settings, in the order of
-    preference. Raises RadioSettingsError if the channel does not lie in any band of the region.
-    """
-    violated = []
-    if use.settings.power_dbm >= CHIP_DBM and use.duty > CHIP_DUTY:
-        violated.append(
-            f"the chip allows {CHIP_DBM} dBm for {_percent(CHIP_DUTY)} of the time (SX1276 data sheet); {_duty_text(use)}. "
-            f"Would comply: {MAX_PRESET_DBM} dBm"
-        )
-    if region is None:
-        return violated
+def chip_violation(use: ChannelUse) -> str | None:
+    """Return a sentence if the chip does not tolerate the use."""
+    if use.settings.power_dbm < CHIP_DBM or use.duty <= CHIP_DUTY:
+        return None
+    return (
+        f"the chip allows {CHIP_DBM} dBm for {_percent(CHIP_DUTY)} of the time (SX1276 data sheet); {_duty_text(use)}: "
+        f"use {MAX_PRESET_DBM} dBm"
+    )
+
+
+def violations(use: ChannelUse, region: str) -> list[str]:
+    """Return a sentence for each violated limit of a region; raises RadioSettingsError for a channel outside of it."""
     settings = use.settings
+    violated: list[str] = []
     for band in bands_of(region, frequency_hz=settings.frequency_hz, bandwidth_hz=settings.bandwidth_hz):
         if band.erp_dbm is None:
             violated += _american(use, region)
         else:
-            violated += _european(use, region, band, band.erp_dbm, others)
+            violated += _european(use, region, band, band.erp_dbm)
     return violated
 
 
-def _european(
-    use: ChannelUse, region: str, band: Band, limit_dbm: float, others: Sequence[ChannelUse]
-) -> list[str]:
+def compliant_use(use: ChannelUse, region: str, plan: Callable[[LoRaSettings], ChannelUse]) -> ChannelUse:
+    """Return a use without violations that changes as little as possible.
+
+    Power first, then channel, then less gain of the antenna, which an attenuator or a longer cable gives. ``plan``:
+    returns the use of the channel with other settings.
+    """
+    return next(
+        candidate for candidate in _candidates(use, region, plan) if not violations(candidate, region)
+    )
+
+
+def _candidates(
+    use: ChannelUse, region: str, plan: Callable[[LoRaSettings], ChannelUse]
+) -> Iterator[ChannelUse]:
+    here, there = Channel(use.settings.frequency_hz, use.settings.bandwidth_hz), CHANNELS[region]
+    for channel in (here, there):
+        power_dbm = preset_power_dbm(
+            region, **channel._asdict(), antenna_gain_dbi=use.antenna_gain_dbi
+        )  # fmt: skip
+        yield plan(replace(use.settings, **channel._asdict(), power_dbm=power_dbm))
+    # The limit falls by a decibel per decibel of gain, at most: as much gain as the smallest power allows.
+    limit_dbm = power_limit_dbm(region, **there._asdict(), antenna_gain_dbi=use.antenna_gain_dbi)
+    gain_dbi = math.floor(10 * (use.antenna_gain_dbi + limit_dbm - MIN_POWER_DBM) + _ROUNDING_DB) / 10
+    quiet = plan(replace(use.settings, **there._asdict(), power_dbm=MIN_POWER_DBM))
+    yield quiet._replace(antenna_gain_dbi=gain_dbi)
+
+
+def _european(use: ChannelUse, region: str, band: Band, limit_dbm: float) -> list[str]:
     violated = []
-    name = f"{region}, {_mhz(band)} (ERC/REC 70-03)"
-    erp_dbm = use.eirp_dbm - DIPOLE_DBI
-    if erp_dbm > limit_dbm:
+    name = f"{region}, {band.low_hz / 1e6:g} to {band.high_hz / 1e6:g} MHz (ERC/REC 70-03)"
+    free_dbm = band.unlimited_duty_erp_dbm
+    if use.erp_dbm > limit_dbm + _ROUNDING_DB:
+        violated.append(f"{name}: at most {limit_dbm:g} dBm e.r.p.; {_power_text(use)} are {use.erp_dbm:.1f}")
+    if band.duty_cycle is None or use.duty <= band.duty_cycle:
+        return violated
+    if free_dbm is None:
         violated.append(
-            f"{name}: at most {limit_dbm:g} dBm e.r.p.; {use.settings.power_dbm} dBm into {use.antenna_gain_dbi:g} dBi "
-            f"are {erp_dbm:.1f}. Would comply: {erp_dbm - limit_dbm:.1f} dB less power or gain"
+            f"{name}: a radio may transmit for {_percent(band.duty_cycle)} of any hour; {_duty_text(use)}"
         )
-    unlimited = band.unlimited_duty_erp_dbm is not None and erp_dbm <= band.unlimited_duty_erp_dbm
-    if band.duty_cycle is not None and use.duty > band.duty_cycle and not unlimited:
-        remedies = [
-            _alternative(other, use) for other in others if other.duty <= band.duty_cycle and other is not use
-        ][:1]
-        remedies += [
-            f"{_mhz(free)} with at most {free.unlimited_duty_erp_dbm:g} dBm e.r.p., where it is not limited"
-            for free in REGIONS[region]
-            if free.unlimited_duty_erp_dbm is not None
-            and use.settings.bandwidth_hz <= free.high_hz - free.low_hz
-        ]
-        remedies.append("listening before talking with a change of frequency, which tsgt does not do")
+    elif use.erp_dbm > free_dbm + _ROUNDING_DB:
         violated.append(
-            f"{name}: a radio may transmit for {_percent(band.duty_cycle)} of any hour; {_duty_text(use)}. "
-            f"Would comply: {'; '.join(remedies)}"
+            f"{name}: above {free_dbm:g} dBm e.r.p. a radio may transmit for {_percent(band.duty_cycle)} of any hour; "
+            f"{_power_text(use)} are {use.erp_dbm:.1f}, and {_duty_text(use)}"
         )
     return violated
 
@@ -186,43 +242,21 @@ def _american(use: ChannelUse, region: str) -> list[str]:
     settings, gain_dbi = use.settings, use.antenna_gain_dbi
     if settings.bandwidth_hz >= WIDE_HZ:
         limit_dbm = WIDE_DBM - max(gain_dbi - WIDE_GAIN_DBI, 0)
-        if settings.power_dbm <= limit_dbm:
-            return []
-        excess_db = settings.power_dbm - limit_dbm
         sentence = (
             f"{region} ({wide}): with an antenna of {gain_dbi:g} dBi at most {limit_dbm:g} dBm; it is "
-            f"{settings.power_dbm} dBm. Would comply: {excess_db:.1f} dB less power or gain"
+            f"{settings.power_dbm} dBm"
         )
-        return [sentence]
-    excess_db = use.eirp_dbm - NARROW_EIRP_DBM
-    if excess_db <= 0:
-        return []
-    remedies = [
-        f"a bandwidth of {WIDE_HZ // 1000} kHz, then up to {WIDE_DBM} dBm ({wide})",
-        "hopping over 25 channels or more, which tsgt does not do",
-    ]
-    if settings.power_dbm - excess_db >= MIN_POWER_DBM:
-        remedies.insert(1, f"{excess_db:.1f} dB less power")
-    else:
-        attenuation_db = MIN_POWER_DBM + gain_dbi - NARROW_EIRP_DBM
-        remedies.insert(
-            1,
-            f"{MIN_POWER_DBM} dBm, the least that the chip gives, and {attenuation_db:.1f} dB of attenuation",
-        )
+        return [sentence] if settings.power_dbm > limit_dbm + _ROUNDING_DB else []
     sentence = (
         f"{region} ({narrow}): a fixed channel of {settings.bandwidth_hz / 1000:g} kHz may radiate {NARROW_EIRP_DBM} "
-        f"dBm e.i.r.p. (50 mV/m at 3 m); {settings.power_dbm} dBm into {gain_dbi:g} dBi are {use.eirp_dbm:.1f}. "
-        f"Would comply: {'; '.join(remedies)}"
+        f"dBm e.i.r.p. (50 mV/m at 3 m), from {WIDE_HZ // 1000} kHz on {WIDE_DBM} dBm at the connector ({wide}); "
+        f"{_power_text(use)} are {use.eirp_dbm:.1f}"
     )
-    return [sentence]
+    return [sentence] if use.eirp_dbm > NARROW_EIRP_DBM + _ROUNDING_DB else []
 
 
-def _alternative(other: ChannelUse, use: ChannelUse) -> str:
-    settings = other.settings
-    return (
-        f"SF {settings.spreading_factor} with 4/{settings.coding_rate}, {_percent(other.duty)} instead of "
-        f"{_percent(use.duty)}"
-    )
+def _power_text(use: ChannelUse) -> str:
+    return f"{use.settings.power_dbm} dBm into {use.antenna_gain_dbi:g} dBi"
 
 
 def _duty_text(use: ChannelUse) -> str:
@@ -233,7 +267,3 @@ def _duty_text(use: ChannelUse) -> str:
 
 def _percent(part: float) -> str:
     return f"{100 * part:.3g} %"
-
-
-def _mhz(band: Band) -> str:
-    return f"{band.low_hz / 1e6:g} to {band.high_hz / 1e6:g} MHz"

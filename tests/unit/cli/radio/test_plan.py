@@ -18,7 +18,7 @@ CLASSIC = ("radio", "plan", "--protocol", "classic", "--stations")
 
 def test_plan_as_json(tsgt: Tsgt) -> None:
     """The output has all figures, for the given settings and for the table of others."""
-    outcome = tsgt(*SUPERFRAME, 3, "--json")
+    outcome = tsgt(*SUPERFRAME, 3, "--table", "--json")
     assert outcome.code == 0
     plan = outcome.json()
     assert (plan["cycle_ms"], plan["rate_hz"], plan["warnings"]) == (pytest.approx(400), 2.5, [])
@@ -33,19 +33,21 @@ def test_plan_as_json(tsgt: Tsgt) -> None:
 
 
 def test_plan_as_text(tsgt: Tsgt) -> None:
-    """The given number of stations has a column in the table."""
-    outcome = tsgt(*CLASSIC, 5)
+    """The given number of stations has a column in the table, which is printed on request."""
+    assert "SF 7" not in tsgt(*CLASSIC, 5).out
+    outcome = tsgt(*CLASSIC, 5, "--table")
     assert outcome.code == 0
     lines = outcome.out.splitlines()
     assert lines[0] == "channel      905 MHz, SF 9, 250 kHz, 4/6, 2 dBm"
-    assert lines[1] == "cycle        1017 ms for 5 stations"
+    assert lines[1] == "radiated     4.2 dBm e.i.r.p., 2.0 dBm e.r.p. with an antenna of 2.15 dBi"
+    assert lines[2] == "cycle        1017 ms for 5 stations"
     assert any(line.split() == ["margin", *"12345", "6", "8"] for line in lines)
     assert sum(line.startswith("SF ") for line in lines) == 24
 
 
 def test_link_margin_is_power_minus_loss_minus_sensitivity(tsgt: Tsgt) -> None:
     """1 km of free space is 91.6 dB at 905 MHz; SF 9 at 250 kHz needs -126 dBm."""
-    arguments = ("--power-dbm", 14, "--antenna-gain-db", 0, "--path-loss-exponent", 2, "--distance-m", 1000)
+    arguments = ("--power-dbm", 14, "--antenna-gain-dbi", 0, "--path-loss-exponent", 2, "--distance-m", 1000)
     plan = tsgt(*SUPERFRAME, 3, *arguments, "--json").json()
     assert plan["link_margin_db"] == pytest.approx(14 - 91.58 + 126.02, abs=0.05)
 
@@ -66,29 +68,43 @@ def test_insufficient_capacity_is_a_warning(tsgt: Tsgt) -> None:
 
 
 @pytest.mark.parametrize(
-    ("region", "frequency_mhz", "exceeds"),
-    [("EU868", 869.525, "10 % of any hour"), ("US915", 905.0, "47 CFR 15.249"), ("CA915", 905.0, "RSS-210")],
+    ("region", "frequency_mhz", "bandwidth_khz", "power_dbm"),
+    [("EU868", 869.85, 250, 7), ("US915", 905.0, 500, 17), ("CA915", 905.0, 500, 17)],
 )
-@pytest.mark.slow
-def test_region_selects_channel_and_limits(
-    tsgt: Tsgt, region: str, frequency_mhz: float, exceeds: str
+def test_region_selects_a_legal_channel(
+    tsgt: Tsgt, region: str, frequency_mhz: float, bandwidth_khz: float, power_dbm: int
 ) -> None:
-    """The plan is checked against the region's limits, with settings that comply."""
-    plan = tsgt(*SUPERFRAME, 3, "--region", region, "--json").json()
-    assert plan["frequency_mhz"] == frequency_mhz
-    (warning,) = plan["warnings"]
-    assert exceeds in warning
-    assert "Would comply: " in warning
+    """Without other options the plan is legal: with the channel, bandwidth and power of the region."""
+    outcome = tsgt(*SUPERFRAME, 3, "--region", region, "--json")
+    plan = outcome.json()
+    assert (outcome.code, plan["violations"], plan["remedy"], plan["warnings"]) == (0, [], None, [])
+    found = (plan["frequency_mhz"], plan["bandwidth_khz"], plan["power_dbm"])
+    assert found == (frequency_mhz, bandwidth_khz, power_dbm)
+    assert "table" not in plan
 
 
-@pytest.mark.slow
-def test_compliant_settings_have_no_warning(tsgt: Tsgt) -> None:
-    """500 kHz in the USA, and 7 dBm above 869.7 MHz in Europe."""
-    for arguments in (
-        ("--region", "US915", "--bandwidth-khz", 500),
-        ("--region", "EU868", "--frequency-mhz", 869.85, "--power-dbm", 7),
-    ):
-        assert tsgt(*SUPERFRAME, 3, *arguments, "--json").json()["warnings"] == []
+@pytest.mark.parametrize(
+    ("arguments", "exceeded", "remedy"),
+    [
+        (
+            ("EU868", "--frequency-mhz", 869.525),
+            "may transmit for 10 % of any hour",
+            "frequency_mhz = 869.85, power_dbm = 7",
+        ),
+        (("US915", "--bandwidth-khz", 250), "47 CFR 15.249", "bandwidth_khz = 500, power_dbm = 17"),
+        (("EU433",), "above 0 dBm e.r.p.", "antenna_gain_dbi = 0.1 by an attenuator of 2.0 dB"),
+    ],
+)
+def test_violation_ends_with_the_remedy(
+    tsgt: Tsgt, arguments: tuple[object, ...], exceeded: str, remedy: str
+) -> None:
+    """Exit code 3; the remedy is the last line."""
+    outcome = tsgt(*SUPERFRAME, 3, "--region", *arguments)
+    assert outcome.code == 3
+    *_, violation, last = outcome.out.splitlines()
+    assert violation.startswith("VIOLATION")
+    assert exceeded in violation
+    assert last == f"remedy       {remedy}"
 
 
 @pytest.mark.slow

@@ -97,7 +97,7 @@ def check_recorded_setup(
             return check_few_prisms(observations, states, bias, samples, mounting, imu.noise, Gravity.of(imu))
         fit = fit_trajectory(observations, prior=parameters.pipeline.motion, noise_scale=1.0, rest=())
         return check_imu_setup(
-            fit.observations, fit.trajectory.knots, samples, mounting, imu.noise, Gravity.of(imu)
+            fit.observations, fit.trajectory, samples, mounting, imu.noise, Gravity.of(imu)
         )
     except (
         GeometryError,

@@ -7,7 +7,7 @@ robot that turns about one axis only leaves the rotation about this axis open; t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.inertial import Gravity, InertialSamples
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import States
+    from tsgt.geometry.trajectory import States, Trajectory
 
 GRID_S = 0.02
 SMOOTHING_S = 0.4  # Of rates and forces of both sides: what the stations can follow
@@ -31,10 +31,14 @@ RATE_SIGMA_RADPS = 0.02
 FORCE_SIGMA_MPS2 = (
     0.5  # Of the difference between the IMU and the stations, smoothed; includes the lever arm's
 )
+MAX_RATE_SIGMA_RADPS = 0.1
+"""Of the trajectory's rates, where they are compared. Three prisms tell them to 0.015, two to 0.06; one alone does not."""
 MIN_TURNING_RADPS = 0.03  # rms about the mean
 MIN_CORRELATION = 0.96
 """Of rates without noise; the share of the noise is the sigma above. The slow turns of two drives may agree to 0.95."""
 MIN_OVERLAP_S = 20.0
+
+_RATE = slice(9, 12)  # Components of the error of a state
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +72,17 @@ class Products(NamedTuple):
     forces: FloatArray  # (3, 3)
 
 
+def series_of_trajectory(trajectory: Trajectory, gravity: Gravity) -> Series:
+    """Rates and forces in the axes of the robot on a grid, known where enough prisms were measured to tell the rates."""
+    series = series_of_states(trajectory.knots, gravity)
+    grid_s = series.start_s + np.arange(len(series.known)) * GRID_S
+    variance = np.trace(trajectory.covariance[:, _RATE, _RATE], axis1=1, axis2=2)
+    certain = np.interp(grid_s, trajectory.knots.time_s, np.sqrt(variance)) < MAX_RATE_SIGMA_RADPS
+    return replace(series, known=series.known & certain)
+
+
 def series_of_states(states: States, gravity: Gravity) -> Series:
-    """Rates and forces in the axes of the robot from the states of a trajectory, on a grid."""
+    """Rates and forces in the axes of the robot from states, on a grid."""
     start_s = float(states.time_s[0])
     grid_s = start_s + np.arange(int((states.time_s[-1] - start_s) / GRID_S) + 1, dtype=np.float64) * GRID_S
     to_robot = np.swapaxes(states.rotation, 1, 2)

@@ -17,7 +17,12 @@ from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.inertial import InertialStates, Mounting, contiguous
 from tsgt.geometry.inertial.solver import diffuse_inertial_prior
 from tsgt.geometry.inertial.states import TILT_DIM
-from tsgt.geometry.inertial_calibration.alignment import Alignment, align, series_of_samples, series_of_states
+from tsgt.geometry.inertial_calibration.alignment import (
+    Alignment,
+    align,
+    series_of_samples,
+    series_of_trajectory,
+)
 from tsgt.geometry.inertial_calibration.joint_solver import (
     JointSolution,
     minimise,
@@ -94,7 +99,7 @@ def calibrate_imu(
     report = on_progress or (lambda _: None)
     check_duration(observations, samples)
     fit = fit_trajectory(observations, on_progress=lambda share: report(0.5 * share))
-    alignment = align(series_of_states(fit.trajectory.knots, gravity), series_of_samples(samples))
+    alignment = align(series_of_trajectory(fit.trajectory, gravity), series_of_samples(samples))
     filled = contiguous(samples, noise)
     initial = ImuSetup.initial(
         Mounting(alignment.rotation, np.zeros(3)), alignment.latency_s, int(observations.station.max()) + 1

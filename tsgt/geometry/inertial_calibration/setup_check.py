@@ -27,6 +27,7 @@ from tsgt.geometry.inertial_calibration.alignment import (
     products_at,
     series_of_samples,
     series_of_states,
+    series_of_trajectory,
     turns,
 )
 from tsgt.geometry.inertial_calibration.joint_solver import solve_jointly, states_of_imu
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.inertial import Gravity, InertialSamples
     from tsgt.geometry.inertial_calibration.alignment import Products, Series
     from tsgt.geometry.rigid import FloatArray
-    from tsgt.geometry.trajectory import Observations, States
+    from tsgt.geometry.trajectory import Observations, States, Trajectory
     from tsgt.model import ImuNoise
 
 Cause = Literal[
@@ -110,7 +111,7 @@ class SetupCheck:
 
 def check_imu_setup(
     observations: Observations,
-    states: States,
+    trajectory: Trajectory,
     samples: InertialSamples,
     mounting: Mounting,
     noise: ImuNoise,
@@ -123,14 +124,14 @@ def check_imu_setup(
     Parameters
     ----------
     observations : In the order of time, with the layout in the axes of the robot.
-    states : Of the robot at the reference point of the layout, from the stations alone.
+    trajectory : Of the robot at the reference point of the layout, from the stations alone.
     samples : Latency and gyro matrix as configured are applied.
     mounting : As configured, from that reference point.
     noise : Of the data sheet.
     """
     if not len(samples):
         return SetupCheck()
-    robot, imu = series_of_states(states, gravity), series_of_samples(samples)
+    robot, imu = series_of_trajectory(trajectory, gravity), series_of_samples(samples)
     shorter_s = GRID_S * min(np.count_nonzero(each.known) for each in (robot, imu))
     ours, theirs = overlap_at(robot, imu, 0.0)
     if GRID_S * len(ours) < max(MIN_SHARED_S, MIN_OVERLAP_SHARE * shorter_s):
@@ -151,7 +152,7 @@ def check_imu_setup(
     if gross is not None:
         return SetupCheck((gross,))
     start = _Start(alignment.rotation, alignment.latency_s, alignment.gyro_bias)
-    found = _estimated_errors(observations, states, samples, mounting, noise, gravity, start)
+    found = _estimated_errors(observations, trajectory.knots, samples, mounting, noise, gravity, start)
     return replace(found, excluded=found.excluded | GROSS)
 
 

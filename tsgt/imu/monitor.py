@@ -81,12 +81,11 @@ class SampleCounter:
 
 
 class _Piece(NamedTuple):
-    """A record's share of the window."""
+    """A record's share of the window, without its forces."""
 
     received_ns: int
     samples: int
     duration_ns: int
-    force_sum_mps2: float
 
 
 class ImuMonitor:
@@ -98,6 +97,8 @@ class ImuMonitor:
     def __init__(self) -> None:
         self._hello: HelloLine | None = None
         self._window: deque[_Piece] = deque()
+        self._force_sums_mps2: deque[float] = deque()  # of the same records
+        self._window_samples = self._window_ns = 0
         self._counter = SampleCounter()
         self._saturated = 0
         self._values: tuple[Vector3, Vector3] | None = None
@@ -110,16 +111,22 @@ class ImuMonitor:
         self._hello = hello
         self._counter.program_started()
         self._window.clear()
+        self._force_sums_mps2.clear()
+        self._window_samples = self._window_ns = 0
 
     def samples(self, record: ImuSamples) -> None:
         """Take a record."""
         self._counter.count(record)
-        force_sum = sum(math.hypot(*force) for force in record.specific_force_mps2)
-        self._window.append(
-            _Piece(record.received_ns, len(record.stamp_ns), sum(record.duration_ns), force_sum)
-        )
+        piece = _Piece(record.received_ns, len(record.stamp_ns), sum(record.duration_ns))
+        self._window.append(piece)
+        self._force_sums_mps2.append(sum(math.hypot(*force) for force in record.specific_force_mps2))
+        self._window_samples += piece.samples
+        self._window_ns += piece.duration_ns
         while self._window[0].received_ns <= record.received_ns - RATE_WINDOW_NS:
-            self._window.popleft()
+            oldest = self._window.popleft()
+            self._force_sums_mps2.popleft()
+            self._window_samples -= oldest.samples
+            self._window_ns -= oldest.duration_ns
         self._find_problem(record)
 
     def lost(self, now_ns: int) -> bool:
@@ -171,11 +178,10 @@ class ImuMonitor:
         return "it repeats the same values" if self._same_ns >= STUCK_NS else ""
 
     def _implausible(self) -> str:
-        samples = sum(piece.samples for piece in self._window)
-        duration_ns = sum(piece.duration_ns for piece in self._window)
+        samples, duration_ns = self._window_samples, self._window_ns
         if duration_ns < _MIN_WINDOW_NS or self._hello is None:
             return ""
-        force = sum(piece.force_sum_mps2 for piece in self._window) / samples
+        force = sum(self._force_sums_mps2) / samples
         if not MIN_GRAVITY_MPS2 <= force <= MAX_GRAVITY_MPS2:
             return (
                 f"the mean specific force is {force:.2f} m/s^2, expected about 9.8: "

@@ -282,10 +282,7 @@ def _estimated_errors(
     )
 
     def bound(jacobian: FloatArray) -> float:
-        """Return what an error is below for certain."""
-        # What nothing tells is taken as configured: zero up to rounding, of either sign.
-        sigma = np.sqrt(max(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1], 0.0))
-        return float(np.linalg.norm(jacobian @ error) + EXCLUDED_SIGMAS * sigma)
+        return certain_bound(jacobian @ error, jacobian @ covariance @ jacobian.T)
 
     findings: list[SetupFinding] = []
     excluded: set[Cause] = {cause for cause, jacobian, limit in parts if bound(jacobian) < limit}
@@ -308,6 +305,15 @@ def _estimated_errors(
     )
     confirmed = not findings and max(bounds) < CONFIRMED_LIMITS
     return SetupCheck(tuple(findings), frozenset(excluded), confirmed)
+
+
+def certain_bound(error: FloatArray, covariance: FloatArray) -> float:
+    """Return what the norm of an error is below for certain.
+
+    What nothing tells is taken as configured: its covariance is zero up to rounding, of either sign.
+    """
+    variance = max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0)
+    return float(np.linalg.norm(error)) + EXCLUDED_SIGMAS * math.sqrt(variance)
 
 
 def _unseen_rotations(layout: FloatArray) -> FloatArray:

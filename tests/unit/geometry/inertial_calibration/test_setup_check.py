@@ -13,6 +13,7 @@ from harness.imu_calibration import uncalibrated_drive
 from tsgt.geometry import exp_so3
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding, check_imu_setup
+from tsgt.geometry.inertial_calibration.setup_check import certain_bound
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,6 +26,17 @@ if TYPE_CHECKING:
     from tsgt.model import ImuNoise
 
 DEG = np.pi / 180
+
+
+@pytest.mark.parametrize("variance", [1e-24, 0.0, -1e-24])
+def test_bound_of_a_rotation_that_nothing_tells(variance: float) -> None:
+    """It is as configured; the rounding of its covariance, of either sign, makes it no NaN, which no limit would be below."""
+    assert certain_bound(np.zeros(3), variance * np.eye(3)) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_bound_adds_two_sigmas_of_the_least_certain_direction() -> None:
+    """Of three components together."""
+    assert certain_bound(np.array([0.3, 0.0, 0.4]), np.diag([0.01, 0.04, 0.01])) == pytest.approx(0.9)
 
 
 @dataclass(frozen=True)

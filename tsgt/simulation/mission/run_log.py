@@ -320,6 +320,7 @@ class MissionResult:
     superframe: bool
     outages: tuple[Outage, ...] = ()
     faults: Counter[FaultKind] = field(default_factory=Counter)  # number of faults by kind
+    knocks_s: tuple[float, ...] = ()  # when the IMU was knocked, in s from the start
     faults_end_s: float | None = None  # end of the faults in s from the start; None: no faults
     rate_hz: dict[int, float] = field(default_factory=dict)  # measurement rate by station number
     oversized_collections: tuple[str, ...] = ()  # collections of the daemons that exceeded their bounds

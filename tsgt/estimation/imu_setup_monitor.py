@@ -118,7 +118,7 @@ class ImuSetupMonitor:
         self._result: Callable[[], SetupCheck] | None = None
         self._result_ns = 0
         self._standing: dict[Cause, SetupFinding] = {}
-        self._confirmed = False
+        self._confirmed = self._displaced = False
         self._open = tuple(_PARTS.values())
         self._events: list[EventRecord] = []
 
@@ -142,8 +142,13 @@ class ImuSetupMonitor:
         events, self._events = self._events, []
         return events
 
-    def restart(self) -> None:
-        """Confirm the set-up anew, from what comes from now on: it may have changed."""
+    def restart(self, *, blow: bool = False) -> None:
+        """Confirm the set-up anew, from what comes from now on: it may have changed.
+
+        After a ``blow`` fewer than three prisms confirm nothing any more: they do not tell all rotations, and what they do not tell
+        is not as configured for certain.
+        """
+        self._displaced |= blow and len(self._parameters.prisms) < MIN_PRISMS
         self._measurements.clear()
         self._records.clear()
         self._next_ns = self._result = None
@@ -189,7 +194,7 @@ class ImuSetupMonitor:
             self._standing[finding.cause] = finding
         if self._standing:
             self._confirmed = False
-        elif not self._confirmed and check.confirmed:
+        elif not self._confirmed and check.confirmed and not self._displaced:
             self._confirmed = True
             self._next_ns = now_ns + INTERVAL_NS
             message = _CONFIRMATION_BY_PRISMS.get(len(self._parameters.prisms), _CONFIRMATION)

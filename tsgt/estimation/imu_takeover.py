@@ -174,6 +174,11 @@ class InertialWindow(TrajectoryWindow, Protocol):
         ...
 
     @property
+    def blow(self) -> bool:
+        """Whether a blow may have displaced it."""
+        ...
+
+    @property
     def biases(self) -> tuple[FloatArray, FloatArray | None] | None:
         """Newest biases of gyro and accelerometer, (3,) each; None where unknown."""
         ...
@@ -349,7 +354,7 @@ class ImuTakeover:
             # What the samples show by themselves passes; whatever else it was may have come to stay.
             doubt = self._with.setup_in_doubt or self._with.health is None
             if found == ImuUse.DISAGREES and doubt and self._setup is not None:
-                self._setup.restart()
+                self._setup.restart(blow=self._with.blow)
             if self.use == ImuUse.USED:
                 again = now_s - self._used_from_s < PROVEN_S
                 self._quarantine_s = min(2 * self._quarantine_s, MAX_QUARANTINE_S) if again else 0.0

@@ -47,11 +47,14 @@ class Monitored:
 
     checks: list[SetupCheck]
     seconds: int = 0
+    prisms: int = 3
 
     def __post_init__(self) -> None:
         drive = uncalibrated_drive(1.0)
         self.samples, self.point = imu_records(drive)[0], point_measurements(drive)[0]
-        self.monitor = ImuSetupMonitor(parameters_of(drive, drive.imu), start=self.start)
+        parameters = parameters_of(drive, drive.imu)
+        parameters = replace(parameters, prisms=parameters.prisms[: self.prisms])
+        self.monitor = ImuSetupMonitor(parameters, start=self.start)
 
     def start(self, _work: Callable[[], SetupCheck]) -> Callable[[], SetupCheck]:
         """Give the next result."""
@@ -100,6 +103,28 @@ def test_knock_after_confirmation_is_reported() -> None:
     assert [each.event for each in events] == ["imu_setup_confirmed", "imu_setup_wrong", "imu_setup_wrong"]
     assert monitored.monitor.untrusted == "rotation is wrong; latency is wrong"
     assert not monitored.monitor.confirmed
+
+
+@pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
+def test_few_prisms_do_not_confirm_after_a_blow(prisms: int, *, confirmed: bool) -> None:
+    """A drive does not show them all rotations by which the blow may have turned the IMU."""
+    monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
+    monitored.run(18)
+    assert monitored.monitor.confirmed
+    monitored.monitor.restart(blow=True)
+    monitored.run(18)
+    assert monitored.monitor.confirmed == confirmed
+
+
+@pytest.mark.parametrize("prisms", [2, 1])
+def test_few_prisms_confirm_anew_after_a_disagreement(prisms: int) -> None:
+    """Whatever made the samples disagree, it was no blow."""
+    monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
+    monitored.run(18)
+    monitored.monitor.restart()
+    assert not monitored.monitor.confirmed
+    monitored.run(18)
+    assert monitored.monitor.confirmed
 
 
 @dataclass

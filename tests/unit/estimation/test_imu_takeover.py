@@ -48,7 +48,7 @@ class FakeInertialSmoother(FixedLagSmoother):
         super().__init__(prior)
         self.up_m = UP_M
         self.health: str | None = None
-        self.setup_in_doubt = False
+        self.setup_in_doubt = self.blow = False
         self.contradicted = False
         self.wheels: WheelsEstimate | None = None
         self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
@@ -283,10 +283,15 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuTakeover, SimpleNamespace
     monkeypatch.setattr(ImuTakeover, "_compare", lambda *_: None)
     without = SimpleNamespace(converged=True, ambiguous=False)
     window = SimpleNamespace(
-        converged=True, ambiguous=False, health=None, setup_in_doubt=False, add_samples=lambda _: None
+        converged=True,
+        ambiguous=False,
+        health=None,
+        setup_in_doubt=False,
+        blow=False,
+        add_samples=lambda _: None,
     )
-    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="")
-    setup.restart = lambda: setattr(setup, "confirmed", False)
+    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="", blow=False)
+    setup.restart = lambda *, blow: vars(setup).update(confirmed=False, blow=blow)
     takeover = ImuTakeover(
         IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
     )
@@ -314,11 +319,13 @@ def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
     """After a blow, and where the prisms contradict, the IMU may have moved for good."""
     takeover, window, setup = sound
     uses_of(takeover, 0.0, 1.0)
-    window.health, window.setup_in_doubt = (fault if fault != "prisms" else None), fault == "blow"
+    window.health, window.blow = (fault if fault != "prisms" else None), fault == "blow"
+    window.setup_in_doubt = window.blow
     window.ambiguous = fault == "prisms"
     found = [uses_of(takeover, 1.0, 1.6)[-1][0]]
     window.health, window.setup_in_doubt, window.ambiguous = None, False, False
     found.append(uses_of(takeover, 1.6, 7.0)[-1][0])
+    assert setup.blow == (fault == "blow")
     setup.confirmed = True
     found.append(uses_of(takeover, 7.0, 7.1)[-1][0])
     assert found == [ImuUse.DISAGREES, use, ImuUse.USED]
@@ -378,7 +385,7 @@ def test_contradiction_of_the_only_station_lasts(
     """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
-    window.setup_in_doubt = False
+    window.setup_in_doubt = window.blow = False
     window.ambiguous_from_s = 2.5
     first_s = window.ambiguous_from_s + AMBIGUITY_MARGIN_S
     until_s = -np.inf if followed_for_s is None else first_s + followed_for_s

@@ -191,6 +191,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Whether the mounting of the IMU may have changed: by a blow, or by whatever made the samples disagree with the prisms."""
         return self._health.setup_in_doubt
 
+    @property
+    def blow(self) -> bool:
+        """Whether a blow may have displaced it."""
+        return self._health.blow
+
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""
         if not len(new):

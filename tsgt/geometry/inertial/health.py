@@ -77,7 +77,8 @@ class HealthMonitor:
     An axis is at its limit where values repeat exactly that its motion and its noise ought to change: successive ones, or any
     of the last half second.
 
-    ``setup_in_doubt``: the mounting may have changed, by a blow or whatever made the samples disagree with the prisms.
+    ``setup_in_doubt``: the mounting may have changed, by a blow or whatever made the samples disagree with the prisms. ``blow``: by a
+    blow.
     """
 
     def __init__(self, imu: ImuParameters) -> None:
@@ -87,7 +88,7 @@ class HealthMonitor:
         self._newest_s = -np.inf
         self._problem = ""
         self._problem_s = -np.inf
-        self.setup_in_doubt = False
+        self.setup_in_doubt = self.blow = False
         self._recent = np.empty((0, 6))  # Values of the device over the last half second
         self._recent_s = np.empty(0)
         self._steps = np.full(2, np.inf)  # Smallest change of angular rate and specific force
@@ -121,7 +122,7 @@ class HealthMonitor:
         blows: NDArray[np.bool_] = np.abs(forces).max(axis=1) > BLOW_MPS2
         blows &= sound
         if blows.any():
-            self.setup_in_doubt = True
+            self.setup_in_doubt = self.blow = True
             self._report("a blow may have displaced it", float(new.end_s[blows][-1]))
         before = len(self._recent)
         values = np.concatenate([self._recent, values])

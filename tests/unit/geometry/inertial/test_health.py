@@ -166,6 +166,7 @@ def test_blow_puts_the_setup_in_doubt() -> None:
     assert "a blow may have displaced it" in reasons
     assert reasons[-1] is None
     assert monitor.setup_in_doubt
+    assert monitor.blow
     assert not judged(SAMPLES)[0].setup_in_doubt
 
 

@@ -42,10 +42,10 @@ def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
             return BridgeInstrument(config, clock)
 
 
-def radio_key(protocol: ClassicConfig | SuperframeConfig) -> bytes | None:
-    """Return the configured key; None without one. Raises as :func:`~tsgt.radio.key_file.read_key`."""
+def radio_key(protocol: ClassicConfig | SuperframeConfig, *, owner: int | None = None) -> bytes | None:
+    """Return the configured key; None without one. ``owner`` and errors as :func:`~tsgt.radio.key_file.read_key`."""
     if isinstance(protocol, SuperframeConfig) and protocol.key_file is not None:
-        return read_key(protocol.key_file)
+        return read_key(protocol.key_file, owner=owner)
     return None
 
 

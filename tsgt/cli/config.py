@@ -82,15 +82,18 @@ def _report(file: Path) -> dict[str, Any]:
     summary: dict[str, Any] = {}
     if content is not None:
         summary["kind"] = next(kind for kind, model in KINDS.items() if type(content) is model)
-        problems = _problems_at_start(file, content)
+        problems = problems_at_start(file, content)
         if not problems:
             summary |= _summary(content)
     errors = list(dict.fromkeys(str(problem) for problem in problems))
     return {"file": str(file), "ok": not errors, "errors": errors, **summary}
 
 
-def _problems_at_start(file: Path, content: Model) -> list[ConfigError]:
-    """Return what keeps a daemon from starting although the file itself is valid."""
+def problems_at_start(file: Path, content: Model, *, key_owner: int | None = None) -> list[ConfigError]:
+    """Return what keeps a daemon from starting although the file itself is valid.
+
+    ``key_owner``: user id of the daemon, who must own the key; None: that of this process.
+    """
     problems: list[ConfigError] = []
 
     def attempt(step: Callable[..., object], *arguments: Any, **options: Any) -> None:
@@ -103,7 +106,7 @@ def _problems_at_start(file: Path, content: Model) -> list[ConfigError]:
         attempt(check_permissions, file)
     if isinstance(content, ClientConfig | MasterConfig):
         attempt(check_legality, content, file)
-        attempt(radio_key, content.protocol)
+        attempt(radio_key, content.protocol, owner=key_owner)
     match content:
         case MasterConfig():
             before = len(problems)

@@ -18,6 +18,7 @@ from tsgt.log import configure_logging
 
 GROUPS: dict[str, dict[str, tuple[str, str]]] = {
     "Field": {
+        "setup": ("setup.group:setup", "Set up this machine as a station or as the master."),
         "doctor": ("doctor:doctor", "Check that this machine is ready for the field."),
         "config": ("config:config", "Check configuration and set-up files."),
         "calibrate": (

@@ -1,0 +1,274 @@
+"""``tsgt setup``: a Pi from its first boot to running services, by a simulated chip and a simulated instrument."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING
+
+import pytest
+from harness.fake_machine import ADAPTER
+from harness.setup_system import PiToSetUp
+
+from tsgt import service
+from tsgt.cli import doctor
+from tsgt.cli.setup import group, options
+from tsgt.config import ClientConfig, LeicaInstrumentConfig, MasterConfig, load
+from tsgt.config.radio import HardwareRadioConfig
+from tsgt.setup import Mission, encode_mission
+from tsgt.simulation.kernel import run_virtual
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from harness.cli import Outcome, Tsgt
+
+KEY = hashlib.sha256(b"a key").digest()
+MISSION = encode_mission(
+    Mission(
+        region="CA915",
+        frequency_hz=905_000_000,
+        bandwidth_hz=500_000,
+        spreading_factor=9,
+        coding_rate=6,
+        preamble_symbols=8,
+        sync_word=0x34,
+        key=KEY,
+    )
+)
+STATION = ("setup", "station", "--yes", "--station", 2, "--prism-type", "mini_360", "--mission", MISSION)
+MASTER = ("setup", "master", "--yes", "--region", "CA915", "--stations", 3)
+
+
+@pytest.fixture
+def pi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PiToSetUp:
+    """Return a Pi from the image writer, on which the command runs in virtual time."""
+    made = PiToSetUp(tmp_path / "pi")
+    monkeypatch.setattr(options, "this_system", lambda _root: made.system())
+    monkeypatch.setattr(group, "this_system", lambda _root: made.system())
+    monkeypatch.setattr(doctor, "this_machine", made.machine)
+    monkeypatch.setattr(service, "run", run_virtual)
+    return made
+
+
+def client(pi: PiToSetUp) -> ClientConfig:
+    """Return the configuration that was written."""
+    return load(pi.root / "etc/tsgt/client.toml", ClientConfig)
+
+
+def failed(done: Outcome) -> str:
+    """Return the line of the step that failed."""
+    assert done.code == 3, done
+    (line,) = (line for line in done.out.splitlines() if line.startswith("FAILED"))
+    return line
+
+
+def test_station_is_ready_after_one_command(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """SPI on, user made, radio and instrument found, key and configuration in place, service started."""
+    done = tsgt(*STATION)
+    assert done.code == 0, done.out
+    config = client(pi)
+    assert (config.station, config.prism) == (2, 2)
+    assert isinstance(config.instrument, LeicaInstrumentConfig)
+    assert config.instrument.port == pi.root / "dev/serial/by-id" / ADAPTER
+    assert isinstance(config.radio, HardwareRadioConfig)
+    assert config.radio.wiring.nss_pin == 25
+    assert (pi.root / "etc/tsgt/radio.key").read_text() == KEY.hex() + "\n"
+    assert (pi.root / "etc/tsgt/radio.key").stat().st_mode & 0o777 == 0o600
+    assert pi.active == {"tsgt-client.service"}
+    assert not pi.ntp
+
+
+def test_second_run_changes_nothing(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Without any option: all answers are those of before."""
+    tsgt(*STATION)
+    before, pi.commands = pi.files(), []
+    done = tsgt("setup", "station", "--yes")
+    assert done.code == 0, done.out
+    assert "Nothing was changed" in done.out
+    assert (pi.files(), pi.commands) == (before, [])
+
+
+@pytest.mark.usefixtures("pi")
+def test_json_names_each_step(tsgt: Tsgt) -> None:
+    """``ok``, ``detail`` and ``changed`` of each."""
+    said = tsgt(*STATION, "--json").json()
+    assert (said["ok"], said["changed"]) == (True, True)
+    assert list(said["steps"]) == [
+        *("system", "spi", "user", "mission", "radio", "instrument", "key", "configuration", "services"),
+        *("journal", "clock", "doctor", "service"),
+    ]
+    assert all(step["ok"] and step["detail"] for step in said["steps"].values())
+    assert tsgt("setup", "station", "--json").json()["changed"] is False
+
+
+def test_dry_run_changes_nothing(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """It names every file and command, and needs no root."""
+    before, pi.uid = pi.files(), 1000
+    done = tsgt(*STATION, "--dry-run")
+    assert done.code == 0, done.out
+    assert (pi.files(), pi.commands) == (before, [])
+    for change in ("write /boot/firmware/config.txt", "write /etc/tsgt/client.toml", "run systemctl enable"):
+        assert change in done.out
+
+
+@pytest.mark.parametrize("nss_pin", [25, -1])
+def test_chip_select_is_found(tsgt: Tsgt, pi: PiToSetUp, nss_pin: int) -> None:
+    """On the HAT's pin, or by the SPI controller."""
+    pi.nss_pin = nss_pin
+    assert tsgt(*STATION).code == 0
+    radio = client(pi).radio
+    assert isinstance(radio, HardwareRadioConfig)
+    assert radio.wiring.nss_pin == nss_pin
+
+
+def test_baud_rate_of_the_instrument_is_found(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Its name and serial number are printed."""
+    pi.instruments[ADAPTER] = 19_200
+    done = tsgt(*STATION)
+    assert done.code == 0, done.out
+    instrument = client(pi).instrument
+    assert isinstance(instrument, LeicaInstrumentConfig)
+    assert instrument.baud == 19_200
+    assert "at 19200 baud" in done.out
+    assert ", number " in done.out
+
+
+def test_station_without_instrument_waits_for_it(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """It is found when the command is called again."""
+    pi.instruments[ADAPTER] = None
+    line = failed(tsgt(*STATION))
+    assert "--instrument none" in line
+    assert tsgt(*STATION, "--instrument", "none").code == 0
+    pi.instruments[ADAPTER] = 115_200
+    pi.active.clear()
+    assert tsgt("setup", "station", "--yes").code == 0
+    instrument = client(pi).instrument
+    assert isinstance(instrument, LeicaInstrumentConfig)
+    assert str(instrument.port).endswith(ADAPTER)
+
+
+def test_two_instruments_need_a_choice(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """The message names both."""
+    pi.plug_in("usb-other-port0", 115_200)
+    line = failed(tsgt(*STATION))
+    assert ADAPTER in line
+    assert "usb-other-port0" in line
+    other = pi.root / "dev/serial/by-id/usb-other-port0"
+    assert tsgt(*STATION, "--instrument", other).code == 0
+
+
+def test_radio_that_does_not_respond_stops_the_setup(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """The message says where it was looked for; no configuration is written."""
+    pi.nss_pin = None
+    line = failed(tsgt(*STATION))
+    assert line.startswith("FAILED  radio")
+    assert "spidev0.0" in line
+    assert not (pi.root / "etc/tsgt/client.toml").exists()
+
+
+def test_spi_that_needs_a_reboot_says_so(tsgt: Tsgt, pi: PiToSetUp, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After it, the same command goes on."""
+    monkeypatch.setattr("tsgt.cli.setup.common._SPI_WAIT_S", 0.0)
+    pi.spi_at_boot = True
+    assert "reboot" in failed(tsgt(*STATION))
+    pi.boot()
+    assert tsgt(*STATION).code == 0
+
+
+def test_user_without_root_is_told_to_use_sudo(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Before anything is changed."""
+    before, pi.uid = pi.files(), 1000
+    assert "sudo tsgt setup station" in failed(tsgt(*STATION))
+    assert pi.files() == before
+
+
+def test_damaged_mission_text_is_rejected(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """By its check sum, before any key is written."""
+    damaged = MISSION.replace("/9/", "/8/", 1)
+    done = tsgt("setup", "station", "--yes", "--station", 1, "--prism-type", "360", "--mission", damaged)
+    assert "check sum" in failed(done)
+    assert not (pi.root / "etc/tsgt/radio.key").exists()
+
+
+def test_mission_may_be_a_file(tsgt: Tsgt, pi: PiToSetUp, tmp_path: Path) -> None:
+    """As `tsgt setup mission` printed it: the first line counts."""
+    (tmp_path / "mission.txt").write_text(MISSION + "\n")
+    options = (*STATION[:-1], tmp_path / "mission.txt")
+    assert tsgt(*options).code == 0
+    assert (pi.root / "etc/tsgt/radio.key").exists()
+
+
+def test_key_of_another_mission_stays(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Unless it is asked for."""
+    tsgt(*STATION)
+    other = KEY[::-1].hex() + "\n"
+    (pi.root / "etc/tsgt/radio.key").write_text(other)
+    assert "--replace-key" in failed(tsgt(*STATION))
+    assert (pi.root / "etc/tsgt/radio.key").read_text() == other
+    assert tsgt(*STATION, "--replace-key").code == 0
+    assert (pi.root / "etc/tsgt/radio.key").read_text() == KEY.hex() + "\n"
+
+
+def test_edited_configuration_stays_and_differences_are_shown(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Unless it is asked for; then the old one is kept beside it."""
+    tsgt(*STATION)
+    path = pi.root / "etc/tsgt/client.toml"
+    edited = path.read_text().replace("search_window_deg = 40.0", "search_window_deg = 60.0")
+    path.write_text(edited)
+    done = tsgt("setup", "station", "--yes")
+    assert done.code == 0
+    assert "-search_window_deg = 60.0" in done.out
+    assert path.read_text() == edited
+    assert tsgt("setup", "station", "--yes", "--replace-config").code == 0
+    assert "search_window_deg = 40.0" in path.read_text()
+    assert path.with_name("client.toml.before-setup").read_text() == edited
+
+
+def test_other_answers_replace_a_configuration_of_setup(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """One that nobody has edited; the service takes the new one."""
+    tsgt(*STATION)
+    pi.commands = []
+    assert tsgt("setup", "station", "--yes", "--prism", 3).code == 0
+    assert (client(pi).station, client(pi).prism) == (2, 3)
+    assert pi.commands == ["systemctl restart tsgt-client.service"]
+
+
+@pytest.mark.usefixtures("pi")
+def test_missing_answers_are_named(tsgt: Tsgt) -> None:
+    """A usage error, without a terminal to ask at."""
+    done = tsgt("setup", "station", "--yes", "--mission", MISSION)
+    assert done.code == 2
+    assert "--station" in done.err
+
+
+def test_master_makes_the_key_and_shows_the_text_for_its_stations(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """A station that is given this text has the same channel and key."""
+    done = tsgt(*MASTER)
+    assert done.code == 0, done.out
+    (text,) = (line for line in done.out.splitlines() if line.startswith("TSGT1/"))
+    config = load(pi.root / "etc/tsgt/master.toml", MasterConfig)
+    assert [station.station for station in config.stations] == [1, 2, 3]
+    key = (pi.root / "etc/tsgt/radio.key").read_text().strip()
+    assert tsgt("setup", "mission", "--json").json() == {"mission": text}
+    station = ("setup", "station", "--yes", "--station", 1, "--prism-type", "360", "--mission", text)
+    assert tsgt(*station).code == 0
+    assert (pi.root / "etc/tsgt/radio.key").read_text().strip() == key
+    assert client(pi).radio.model_dump(exclude={"wiring"}) == config.radio.model_dump(exclude={"wiring"})
+
+
+def test_second_run_of_the_master_keeps_the_key(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """And does not show it again."""
+    tsgt(*MASTER)
+    before = pi.files()
+    done = tsgt("setup", "master", "--yes")
+    assert done.code == 0
+    assert "TSGT1" not in done.out
+    assert pi.files() == before
+
+
+def test_antenna_that_no_power_is_legal_with_is_refused(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """With settings that comply, before anything is written."""
+    done = tsgt("setup", "master", "--yes", "--region", "EU433", "--stations", 3, "--antenna-gain-dbi", 9)
+    assert "EU433" in failed(done)
+    assert "attenuator" in failed(done)
+    assert not (pi.root / "etc/tsgt/master.toml").exists()

@@ -1,0 +1,251 @@
+"""The parts of the setup that a station and a master have in common: before the questions, and after them."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from contextlib import aclosing
+from typing import TYPE_CHECKING, TypeVar
+
+import click
+
+from tsgt import service
+from tsgt.cli import doctor
+from tsgt.cli.config import problems_at_start
+from tsgt.cli.doctor import LABELS
+from tsgt.cli.setup.options import answer
+from tsgt.config import MasterConfig, Model, WiringConfig, find_problems
+from tsgt.doctor import run_checks
+from tsgt.errors import RadioError
+from tsgt.log import configure_logging
+from tsgt.radio import LoRaSettings
+from tsgt.radio.planning import DIPOLE_DBI, MIN_POWER_DBM
+from tsgt.setup import (
+    USER,
+    State,
+    clock_step,
+    compare_configuration,
+    configuration_step,
+    find_radio,
+    journal_step,
+    key_step,
+    of_mission,
+    services_step,
+    spi_devices,
+    spi_step,
+    start_step,
+    system_step,
+    user_step,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+    from pathlib import Path
+
+    from tsgt.cli.setup.options import Common
+    from tsgt.cli.setup.session import Session
+    from tsgt.doctor import Finding
+    from tsgt.setup import Mission, RadioAnswers
+
+M = TypeVar("M", bound=Model)
+
+_SPI_WAIT_S = 3.0
+_SPI_POLL_S = 0.2
+
+
+def prepare(session: Session) -> None:
+    """Check the system, enable SPI, and make the user of the services."""
+    configure_logging("error")  # the steps say everything
+    system = session.system
+    session.do(system_step(system, session.role, dry_run=session.dry_run))
+    enabled = session.do(spi_step(system))
+    if system.live and not session.dry_run:
+        until_s = time.monotonic() + _SPI_WAIT_S
+        while enabled and not spi_devices(system) and time.monotonic() < until_s:
+            time.sleep(_SPI_POLL_S)
+        if not spi_devices(system):
+            session.fail("spi", "enabled, but there is no /dev/spidev* before the next boot: sudo reboot")
+    session.do(user_step(system))
+
+
+def configuration_before(session: Session, model: type[M]) -> M | None:
+    """Return the configuration that the machine has; None without a valid one."""
+    path = session.system.path(session.role.config)
+    found = find_problems(path)[0] if path.exists() else None
+    return found if isinstance(found, model) else None
+
+
+def is_running(session: Session) -> bool:
+    """Whether the service is running, and so owns radio and instrument."""
+    system = session.system
+    return system.live and system.run(("systemctl", "is-active", session.role.unit)).code == 0
+
+
+def radio_of(session: Session, common: Common, mission: Mission, before: RadioAnswers | None) -> RadioAnswers:
+    """Return the answers for the radio: the mission's channel, the antenna, and the wiring, by asking the chip."""
+    gain_dbi = float(
+        answer(
+            session,
+            common.antenna_gain_dbi,
+            "--antenna-gain-dbi",
+            "Gain of the antenna in dBi, less the loss of its cable (2.15: a dipole)",
+            float,
+            DIPOLE_DBI if before is None else before.antenna_gain_dbi,
+        )
+    )
+    settings = LoRaSettings(
+        frequency_hz=mission.frequency_hz,
+        spreading_factor=mission.spreading_factor,
+        bandwidth_hz=mission.bandwidth_hz,
+        coding_rate=mission.coding_rate,
+        preamble_symbols=mission.preamble_symbols,
+        sync_word=mission.sync_word,
+        power_dbm=MIN_POWER_DBM,
+    )
+    wiring = _wiring(session, common, settings, None if before is None else before.wiring)
+    licence, power_dbm = (None, None) if before is None else (before.licence, before.power_dbm)
+    return of_mission(
+        mission,
+        antenna_gain_dbi=gain_dbi,
+        licence=common.licence or licence,
+        power_dbm=power_dbm,
+        wiring=wiring,
+    )
+
+
+def _wiring(
+    session: Session, common: Common, settings: LoRaSettings, before: WiringConfig | None
+) -> WiringConfig:
+    """Return the wiring with which the radio responds; in an image the given one."""
+    system, search = session.system, common.search
+    if not system.live:
+        wiring = next(search.wirings(["spidev0.0"]))
+        session.report("radio", ok=True, detail=f"not asked in an image; {_shown(wiring)}")
+        return wiring
+    if before is not None and is_running(session):
+        session.report("radio", ok=True, detail=f"in use by the running service; {_shown(before)}")
+        return before
+    if session.dry_run and not spi_devices(system):
+        wiring = next(search.wirings(["spidev0.0"]))
+        session.report("radio", ok=True, detail="would be asked when SPI is enabled")
+        return wiring
+    candidates = [*([] if before is None else [before]), *search.wirings(spi_devices(system))]
+    machine = doctor.this_machine()
+    try:
+        found = service.run(
+            lambda: find_radio(dict.fromkeys(candidates), machine.open_hal, settings, machine.clock)
+        )
+    except RadioError as error:
+        if session.dry_run and candidates:
+            session.report("radio", ok=True, detail=f"does not respond yet ({error})")
+            return candidates[0]
+        session.fail(
+            "radio",
+            f"no radio responds: {error}. Check that the board sits on all pins (docs/how-to/wire-the-radio.md)",
+        )
+    session.report("radio", ok=True, detail=f"responds; {_shown(found)}; nothing was transmitted")
+    return found
+
+
+def _shown(wiring: WiringConfig) -> str:
+    select = "by the kernel" if wiring.nss_pin < 0 else f"BCM {wiring.nss_pin}"
+    return f"spidev{wiring.spi_bus}.{wiring.spi_device}, chip select {select}, back end {wiring.backend}"
+
+
+def configure(
+    session: Session, common: Common, text: str | None, *, key: bytes | None, expected: Collection[str]
+) -> None:
+    """Install key, configuration and service, check the machine, and start the service.
+
+    ``text``: of the configuration; None keeps the one that is there. ``expected``: checks that fail until the machine is
+    complete, because an instrument or a calibration is still missing.
+    """
+    system, role = session.system, session.role
+    changed = session.do(key_step(system, key, replace=common.replace_key))
+    changed |= _place_configuration(session, common, text)
+    changed |= session.do(services_step(system, role))
+    session.do(journal_step(system))
+    session.do(clock_step(system, role))
+    if session.dry_run:
+        return
+    _check_machine(session, expected)
+    session.do(start_step(system, role, changed=changed))
+
+
+def _place_configuration(session: Session, common: Common, text: str | None) -> bool:
+    system, role = session.system, session.role
+    before = system.read(role.config)
+    if text is None:
+        assert before is not None  # noqa: S101 (our own caller)
+        text = before
+    compared = compare_configuration(before, text, role.config)
+    for line in compared.differences:
+        session.say(f"{'':8}{line}")
+    replace = common.replace_config
+    if compared.differences and session.ask and not replace and not session.dry_run:
+        default = compared.state is State.FROM_SETUP
+        replace = click.confirm(f"Replace {role.config} by these lines (+)?", default=default)
+        if not replace:
+            text = before or text
+    step = configuration_step(system, role, text, replace=replace)
+    if not session.dry_run:
+        checked = text if step.changes else before or text
+        problems = _problems(session, checked)
+        if problems:
+            session.fail("configuration", problems[0])
+    return session.do(step)
+
+
+def _problems(session: Session, text: str) -> list[str]:
+    """Return what would keep the daemon from starting with a configuration, checked before it is put into its place."""
+    system, role = session.system, session.role
+    path = system.path(role.config)
+    trial = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.toml")
+    user = system.user_id(USER)
+    try:
+        trial.write_text(text, encoding="utf-8")
+        content, problems = find_problems(trial)
+        if content is not None:
+            owner = user[0] if system.uid == 0 and user is not None else None
+            problems = problems_at_start(trial, content, key_owner=owner)
+        if isinstance(content, MasterConfig):
+            # They come from the calibration of the day.
+            later = [
+                path
+                for path in (content.setup.station_frames, content.setup.prism_layout)
+                if not path.exists()
+            ]
+            problems = [problem for problem in problems if problem.path not in later]
+    finally:
+        trial.unlink(missing_ok=True)
+    return [str(problem).replace(str(trial), role.config) for problem in problems]
+
+
+def _check_machine(session: Session, expected: Collection[str]) -> None:
+    system, role = session.system, session.role
+    if not system.live:
+        session.report(
+            "doctor", ok=True, detail="not run in an image: sudo tsgt doctor on the machine itself"
+        )
+        return
+    findings = service.run(lambda: _findings(system.path(role.config)))
+    session.doctor = {each.name: {"ok": each.ok, "detail": each.detail} for each in findings}
+    for each in findings:
+        if each.ok is False:
+            session.say(f"{'':8}{LABELS[each.outcome]:7} {each.name.replace('_', ' ')}: {each.detail}")
+    failed = [each.name for each in findings if each.ok is False]
+    serious = [name for name in failed if name not in expected]
+    made = sum(each.ok is not None for each in findings)
+    if serious:
+        session.report(
+            "doctor", ok=False, detail=f"failed: {', '.join(serious)}; sudo tsgt doctor repeats it"
+        )
+    elif failed:
+        session.report("doctor", ok=True, detail=f"{made} checks; to be completed: {', '.join(failed)}")
+    else:
+        session.report("doctor", ok=True, detail=f"all {made} checks passed")
+
+
+async def _findings(path: Path) -> list[Finding]:
+    async with aclosing(run_checks(doctor.this_machine(), path)) as findings:
+        return [finding async for finding in findings]

@@ -1,0 +1,52 @@
+"""Options that a station and a master have in common, and how questions are asked."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tsgt.cli.setup.session import Session, this_system
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.setup import Role, WiringSearch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Common:
+    """Options of both machines; ``antenna_gain_dbi``: None if not given."""
+
+    root: Path
+    yes: bool
+    dry_run: bool
+    as_json: bool
+    antenna_gain_dbi: float | None
+    licence: str | None
+    replace_config: bool
+    replace_key: bool
+    search: WiringSearch
+
+    def session(self, role: Role) -> Session:
+        """Begin a setup."""
+        return Session(
+            system=this_system(self.root),
+            role=role,
+            ask=not self.yes and not self.as_json and sys.stdin.isatty(),
+            dry_run=self.dry_run,
+            quiet=self.as_json,
+        )
+
+
+def answer(session: Session, given: Any, option: str, question: str, kind: Any, default: Any = None) -> Any:
+    """Return the value of an option, or what the operator answers, or the default; a usage error without any."""
+    if given is not None:
+        return given
+    if session.ask:
+        return click.prompt(question, type=kind, default=default)
+    if default is None:
+        raise click.UsageError(f"{option} is needed: {question[:1].lower()}{question[1:]}")
+    return default

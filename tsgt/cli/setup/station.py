@@ -1,0 +1,182 @@
+"""``tsgt setup station``: from the questions to a running client."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from tsgt import service
+from tsgt.cli import doctor
+from tsgt.cli.setup.common import (
+    configuration_before,
+    configure,
+    is_running,
+    prepare,
+    radio_of,
+)
+from tsgt.cli.setup.mission import given_mission, mission_key, mission_of
+from tsgt.cli.setup.options import answer
+from tsgt.cli.setup.session import SetupStopped
+from tsgt.config import ClientConfig
+from tsgt.errors import ConfigError
+from tsgt.setup import (
+    CLIENT,
+    NO_INSTRUMENT,
+    MissionError,
+    SerialPorts,
+    StationAnswers,
+    client_text,
+    find_instruments,
+)
+
+if TYPE_CHECKING:
+    from tsgt.cli.setup.options import Common
+    from tsgt.cli.setup.session import Session
+    from tsgt.setup import FoundInstrument, Mission
+
+DEFAULT_BAUD = 115_200
+DEFAULT_PRISM_TYPE = "mini_360"
+PRISM_TYPES = ("round", "mini", "tape", "360", "mini_360", "mini_zero", "grz121", "mpr122")
+"""Reflectors whose constant the instrument knows; any other needs its constant in the configuration."""
+
+_WITHOUT_INSTRUMENT = {"serial_port", "instrument", "latency_timer"}
+"""Checks that fail without an instrument."""
+
+
+def run_station_setup(
+    common: Common,
+    *,
+    station: int | None,
+    prism: int | None,
+    mission: str | None,
+    instrument: str | None,
+    prism_type: str | None,
+) -> int:
+    """Set up a station; return the exit code."""
+    session = common.session(CLIENT)
+    try:
+        prepare(session)
+        config = configuration_before(session, ClientConfig)
+        before = None if config is None else StationAnswers.of(config)
+        if config is not None and before is None and not common.replace_config:
+            configure(session, common, None, key=None, expected=())
+            return session.finish()
+        shared = _mission(session, mission, config if before is not None else None)
+        number = answer(
+            session,
+            station,
+            "--station",
+            "Number of the station",
+            click.IntRange(1, 16),
+            _of(before, "station"),
+        )
+        tracked = prism or (_of(before, "prism") if station in (None, _of(before, "station")) else None)
+        tracked = answer(
+            session,
+            prism,
+            "--prism",
+            "Number of the prism that it tracks",
+            click.IntRange(1, 16),
+            tracked or number,
+        )
+        reflector = answer(
+            session,
+            prism_type,
+            "--prism-type",
+            "Reflector on the robot",
+            click.Choice(PRISM_TYPES),
+            _of(before, "prism_type") or (DEFAULT_PRISM_TYPE if session.ask else None),
+        )
+        radio = radio_of(session, common, shared, None if before is None else before.radio)
+        port, baud = _instrument(session, instrument, before)
+        answers = StationAnswers(
+            station=number,
+            prism=tracked,
+            port=port,
+            baud=baud,
+            checksum=before.checksum if before is not None else False,
+            prism_type=reflector,
+            radio=radio,
+        )
+        expected = _WITHOUT_INSTRUMENT if port == NO_INSTRUMENT else ()
+        configure(session, common, client_text(answers), key=shared.key, expected=expected)
+    except SetupStopped:
+        pass
+    return session.finish()
+
+
+def _of(before: StationAnswers | None, name: str) -> int | str | None:
+    return None if before is None else getattr(before, name)
+
+
+def _mission(session: Session, given: str | None, config: ClientConfig | None) -> Mission:
+    known = None
+    if config is not None:
+        try:
+            known = mission_of(config.radio, mission_key(session.system))
+        except ConfigError:
+            known = None
+    try:
+        shared = given_mission(session, given, known)
+    except MissionError as error:
+        session.fail("mission", str(error))
+    detail = (
+        f"{shared.frequency_hz / 1e6:g} MHz, SF {shared.spreading_factor}, {shared.bandwidth_hz / 1e3:g} kHz"
+        f"{f', {shared.region}' if shared.region else ''}; check sum right"
+    )
+    session.report("mission", ok=True, detail=detail)
+    return shared
+
+
+def _instrument(session: Session, given: str | None, before: StationAnswers | None) -> tuple[str, int]:
+    """Return port and baud rate of the instrument; a port of its own stands for one that is not there yet."""
+    system = session.system
+    if given == "none" or (given is None and not system.live and before is None):
+        session.report("instrument", ok=True, detail="none yet: connect it later, and call this again")
+        return NO_INSTRUMENT, DEFAULT_BAUD
+    if before is not None and given in (None, before.port) and (not system.live or is_running(session)):
+        session.report("instrument", ok=True, detail=f"{before.port}, as before")
+        return before.port, before.baud
+    if given is not None and not system.live:
+        session.report("instrument", ok=True, detail=f"{given}, not asked in an image")
+        return given, DEFAULT_BAUD
+    machine = doctor.this_machine()
+    ports = [Path(given)] if given is not None else sorted((machine.dev / "serial" / "by-id").glob("*"))
+    access = SerialPorts(open_port=machine.open_port, holder=machine.port_holder)
+    if ports:
+        session.say(f"{'':8}asking for an instrument at {', '.join(map(str, ports))} ...")
+    found, silent = service.run(lambda: find_instruments(ports, access, machine.clock))
+    for port, reason in silent.items():
+        session.say(f"{'':8}{port}: {reason}")
+    return _chosen(session, found, silent, given, before)
+
+
+def _chosen(
+    session: Session,
+    found: list[FoundInstrument],
+    silent: dict[Path, str],
+    given: str | None,
+    before: StationAnswers | None,
+) -> tuple[str, int]:
+    if not found:
+        if before is not None and given is None:
+            session.report("instrument", ok=True, detail=f"{before.port} as before; it does not respond now")
+            return before.port, before.baud
+        if session.ask and click.confirm("No instrument responds. Go on without?", default=False):
+            return _instrument(session, "none", before)
+        reason = next(iter(silent.values()), "there is no serial adapter in /dev/serial/by-id")
+        session.fail("instrument", f"{reason}. To go on without: --instrument none")
+    chosen = found[0]
+    if len(found) > 1:
+        if not session.ask:
+            ports = "; ".join(f"{each.port}: {each}" for each in found)
+            session.fail(
+                "instrument", f"{len(found)} instruments respond, choose one by --instrument: {ports}"
+            )
+        for number, each in enumerate(found, start=1):
+            session.say(f"  {number}  {each.port}: {each}")
+        chosen = found[click.prompt("Which one", type=click.IntRange(1, len(found)), default=1) - 1]
+    session.report("instrument", ok=True, detail=f"{chosen}, {chosen.port}")
+    return str(chosen.port), chosen.baud

@@ -1,0 +1,153 @@
+"""Looks for the radio with each wiring, and for instruments at each serial port, by asking them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from tsgt.config import WiringConfig
+from tsgt.errors import InstrumentError, RadioError, RadioNotFoundError
+from tsgt.radio.from_config import wiring
+from tsgt.radio.sx127x import Chip
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from tsgt.clock import Clock
+    from tsgt.radio import LoRaSettings
+    from tsgt.radio.sx127x import Hal, Wiring
+    from tsgt.station.serial import OpenPort
+
+DEFAULT_BAUD: Final = 115_200
+HAT_NSS_PIN: Final = 25
+KERNEL_NSS: Final = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundInstrument:
+    """An instrument that responds at a serial port."""
+
+    port: Path
+    baud: int
+    model: str
+    serial_number: str
+
+    def __str__(self) -> str:
+        number = f", number {self.serial_number}" if self.serial_number else ""
+        return f"{self.model or 'an instrument without a name'}{number}, at {self.baud} baud"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SerialPorts:
+    """Access to serial ports: how to open one, and the process that has one open, or None."""
+
+    open_port: Callable[[Path], OpenPort]
+    holder: Callable[[Path], str | None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WiringSearch:
+    """Wirings to try; None: what a radio may be wired to. The defaults are the Dragino HAT's."""
+
+    backend: Literal["gpiod", "rpi-gpio"] | None = None
+    spi_device: str | None = None
+    nss_pin: int | None = None
+    reset_pin: int = 17
+    dio0_pin: int = 4
+    gpio_chip: str | None = None
+
+    def wirings(self, devices: Sequence[str]) -> Iterator[WiringConfig]:
+        """Yield each wiring in turn; ``devices``: names such as ``spidev0.0``.
+
+        Chip select on the HAT's pin first: a HAT whose pin happens to be low would also respond to the kernel's.
+        """
+        for backend in ("gpiod", "rpi-gpio") if self.backend is None else (self.backend,):
+            for nss_pin in (HAT_NSS_PIN, KERNEL_NSS) if self.nss_pin is None else (self.nss_pin,):
+                for device in devices if self.spi_device is None else (self.spi_device,):
+                    bus, _, select = device.removeprefix("spidev").partition(".")
+                    yield WiringConfig(
+                        backend=backend,
+                        spi_bus=int(bus),
+                        spi_device=int(select),
+                        reset_pin=self.reset_pin,
+                        dio0_pin=self.dio0_pin,
+                        nss_pin=nss_pin,
+                        gpio_chip=self.gpio_chip if backend == "gpiod" else None,
+                    )
+
+
+async def find_radio(
+    wirings: Iterable[WiringConfig],
+    open_hal: Callable[[Wiring], Hal],
+    settings: LoRaSettings,
+    clock: Clock,
+) -> WiringConfig:
+    """Return the first wiring with which a radio responds and accepts all settings; nothing is transmitted.
+
+    Raises RadioError with the reason for each wiring if none does.
+    """
+    reasons: dict[str, str] = {}
+    for candidate in wirings:
+        try:
+            await _ask_radio(open_hal(wiring(candidate)), settings, clock)
+        except RadioError as error:
+            reasons.setdefault(str(error), _wiring_text(candidate))
+        else:
+            return candidate
+    if not reasons:
+        raise RadioNotFoundError("there is no SPI device /dev/spidev*")
+    raise RadioError("; ".join(f"{where}: {reason}" for reason, where in reasons.items()))
+
+
+async def _ask_radio(hal: Hal, settings: LoRaSettings, clock: Clock) -> None:
+    try:
+        chip = Chip(hal, clock, settings)
+        await chip.set_up()
+        chip.sleep()
+    finally:
+        hal.close()
+
+
+def _wiring_text(candidate: WiringConfig) -> str:
+    select = "by the kernel" if candidate.nss_pin < 0 else f"on BCM {candidate.nss_pin}"
+    return f"{candidate.backend}, spidev{candidate.spi_bus}.{candidate.spi_device}, chip select {select}"
+
+
+async def find_instruments(
+    ports: list[Path], access: SerialPorts, clock: Clock, *, baud: int = DEFAULT_BAUD
+) -> tuple[list[FoundInstrument], dict[Path, str]]:
+    """Ask for an instrument at each port, at all common baud rates, which takes ten seconds for a silent port.
+
+    Returns the instruments, and for every other port why there is none.
+    """
+    # Imported here: a master needs none of it.
+    from tsgt.station.geocom import connect  # noqa: PLC0415
+    from tsgt.station.leica import identify  # noqa: PLC0415
+
+    found, silent = [], {}
+    for port in ports:
+        if (holder := access.holder(port)) is not None:
+            silent[port] = f"it is open in {holder}"
+            continue
+        try:
+            connection = await connect(access.open_port(port), baud, clock, checksum=False)
+        except InstrumentError as error:
+            silent[port] = str(error)
+            continue
+        try:
+            identity = await identify(connection)
+        except InstrumentError as error:
+            silent[port] = str(error)
+        else:
+            found.append(
+                FoundInstrument(
+                    port=port,
+                    baud=connection.port.baud,
+                    model=identity.model,
+                    serial_number=identity.serial_number,
+                )
+            )
+        finally:
+            await connection.close()
+    return found, silent

@@ -12,7 +12,7 @@ import asyncio
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -29,8 +29,10 @@ from tsgt.station.session import ClientSession
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
+    from tsgt.config import TcpAddress
     from tsgt.simulation.instrument import ReportedDistance
     from tsgt.station import Reading
+    from tsgt.station.serial import OpenPort
 
 SETTLE_S: Final = 10.0
 """Duration before the fault: connecting takes two seconds."""
@@ -41,8 +43,8 @@ AFTER_S: Final = 20.0
 STAMP_LIMIT_NS: Final = 25_000_000
 """Bound on the error of a timestamp: replies take 20 to 60 ms, of which 20 are subtracted."""
 
-_DRIFT_PPM: Final = 15.0
-_LATENCY_MS: Final = 20.0
+DRIFT_PPM: Final = 15.0
+LATENCY_MS: Final = 20.0
 _ROUNDING: Final = 1e-9
 
 
@@ -102,45 +104,78 @@ def run_script(script: Script) -> ScriptResult:
 
 async def _run(script: Script, timeline: VirtualTimeline) -> ScriptResult:
     world_rng, station_rng, script_rng = np.random.default_rng(script.seed).spawn(3)
+    station = make_station(timeline, world_rng, station_rng)
+    clock = DriftingClock(VirtualClock(0), drift_ppm=DRIFT_PPM)
+    line = SimulatedLine(station, timeline, clock, name="cable")
+    return await run_act(
+        driver_config(Path("cable"), checksum=script.checksum, latency_ms=LATENCY_MS),
+        station,
+        line.open,
+        clock,
+        act=partial(script.act, Bench(station, line, script_rng)),
+        limit_s=script.limit_s,
+    )
+
+
+def make_station(
+    timeline: VirtualTimeline, world_rng: np.random.Generator, station_rng: np.random.Generator
+) -> SimulatedTotalStation:
+    """Return an instrument that tracks a robot."""
     scenario = ScenarioConfig()
     world = scenario_world(scenario, 200.0, world_rng)
-    clock = DriftingClock(VirtualClock(0), drift_ppm=_DRIFT_PPM)
-    station = SimulatedTotalStation(scenario.stations[0], scenario, world, timeline, station_rng)
-    line = SimulatedLine(station, timeline, clock, name="cable")
-    config = LeicaInstrumentConfig(
-        kind="leica",
-        port=Path("cable"),
-        checksum=script.checksum,
-        prism_type="user",
-        prism_constant_mm=0.0,
-        latency_ms=_LATENCY_MS,
+    return SimulatedTotalStation(scenario.stations[0], scenario, world, timeline, station_rng)
+
+
+def driver_config(port: Path | TcpAddress, **settings: Any) -> LeicaInstrumentConfig:
+    """Return a configuration with the prism constant 0."""
+    return LeicaInstrumentConfig(
+        kind="leica", port=port, prism_type="user", prism_constant_mm=0.0, **settings
     )
+
+
+async def run_act(
+    config: LeicaInstrumentConfig,
+    station: SimulatedTotalStation,
+    open_port: OpenPort,
+    clock: DriftingClock,
+    *,
+    act: Callable[[], Awaitable[None]],
+    limit_s: float,
+    after_s: float = AFTER_S,
+    stamp_limit_ns: Callable[[Reading], float] = lambda _: STAMP_LIMIT_NS,
+) -> ScriptResult:
+    """Run driver and supervisor through a fault; ``stamp_limit_ns``: bound on the error of a reading's timestamp."""
     readings: list[tuple[int, Reading]] = []
     supervisor = InstrumentSupervisor(
-        LeicaInstrument(config, line.open, clock),
+        LeicaInstrument(config, open_port, clock),
         ClientSession(1, 1),
         clock,
-        on_reading=lambda reading: readings.append((timeline.now_ns(), reading)),
+        on_reading=lambda reading: readings.append((_now_ns(), reading)),
         on_record=_ignore,
         on_result=_ignore,
     )
     running = asyncio.create_task(supervisor.run())
     try:
         await asyncio.sleep(SETTLE_S)
-        await script.act(Bench(station, line, script_rng))
-        ended_ns = timeline.now_ns()
-        await asyncio.sleep(AFTER_S)
+        await act()
+        ended_ns = _now_ns()
+        await asyncio.sleep(after_s)
     finally:
         running.cancel()
         await asyncio.wait([running])
     outcome = ScriptResult(offered=len(station.reported_distances))
-    _check(outcome, [reading for _, reading in readings if reading.status.usable], station, clock)
+    usable = [reading for _, reading in readings if reading.status.usable]
+    _check(outcome, usable, station, clock, stamp_limit_ns)
     usable_ns = [at_ns for at_ns, reading in readings if reading.status.usable and at_ns >= ended_ns]
     if usable_ns:
         outcome.recovery_s = (usable_ns[0] - ended_ns) / 1e9
-    if outcome.recovery_s > script.limit_s:
+    if outcome.recovery_s > limit_s:
         outcome.violations.append(f"no distance for {outcome.recovery_s:.1f} s after the end of the fault")
     return outcome
+
+
+def _now_ns() -> int:
+    return round(asyncio.get_running_loop().time() * 1e9)
 
 
 def _ignore(_: object) -> None:
@@ -148,7 +183,11 @@ def _ignore(_: object) -> None:
 
 
 def _check(
-    outcome: ScriptResult, usable: Iterable[Reading], station: SimulatedTotalStation, clock: DriftingClock
+    outcome: ScriptResult,
+    usable: Iterable[Reading],
+    station: SimulatedTotalStation,
+    clock: DriftingClock,
+    stamp_limit_ns: Callable[[Reading], float],
 ) -> None:
     """Compare reported with offered distances."""
     seen: set[ReportedDistance] = set()
@@ -169,7 +208,7 @@ def _check(
             outcome.violations.append(f"reported twice: {reading}")
         seen.add(truth)
         late_ns = clock.true_ns(reading.at_ns) - truth.true_ns
-        if abs(late_ns) > STAMP_LIMIT_NS:
+        if abs(late_ns) > stamp_limit_ns(reading):
             outcome.violations.append(f"timestamped {late_ns / 1e6:.1f} ms after the measurement: {reading}")
 
 

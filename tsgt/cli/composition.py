@@ -13,6 +13,7 @@ from tsgt.config import (
     LeicaInstrumentConfig,
     SimulatedRadioConfig,
     SuperframeConfig,
+    TcpAddress,
 )
 from tsgt.radio.from_config import wiring
 from tsgt.radio.key_file import read_key
@@ -20,11 +21,13 @@ from tsgt.radio.sx127x import SX127x, open_hal
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
+    from pathlib import Path
 
     from tsgt.clock import Clock
     from tsgt.config import ClassicConfig, InstrumentConfig, RadioConfig
     from tsgt.radio import LoRaSettings, Radio, RadioOpener
     from tsgt.station import Instrument
+    from tsgt.station.serial import OpenPort, Port
 
 
 def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
@@ -33,13 +36,28 @@ def make_instrument(config: InstrumentConfig, clock: Clock) -> Instrument:
     match config:
         case LeicaInstrumentConfig():
             from tsgt.station.leica import LeicaInstrument
-            from tsgt.station.serial.serial_port import open_serial_port
 
-            return LeicaInstrument(config, partial(open_serial_port, config.port, clock=clock), clock)
+            return LeicaInstrument(config, instrument_line(config.port, clock), clock)
         case BridgeInstrumentConfig():
             from tsgt.station.bridge import BridgeInstrument
 
             return BridgeInstrument(config, clock)
+
+
+def instrument_line(port: Path | TcpAddress, clock: Clock) -> OpenPort:
+    """Return a function that opens the line to an instrument."""
+    if isinstance(port, TcpAddress):
+        from tsgt.station.serial.tcp_port import open_tcp_port
+
+        address = port
+
+        async def connect(_baud: int) -> Port:
+            return await open_tcp_port(address, clock)
+
+        return connect
+    from tsgt.station.serial.serial_port import open_serial_port
+
+    return partial(open_serial_port, port, clock=clock)
 
 
 def radio_key(protocol: ClassicConfig | SuperframeConfig, *, owner: int | None = None) -> bytes | None:

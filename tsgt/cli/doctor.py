@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt import service
+from tsgt.cli.composition import instrument_line
 from tsgt.cli.options import json_option, path_type
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.clock import SystemClock
@@ -31,7 +32,6 @@ from tsgt.radio.sx127x import open_hal
 
 if TYPE_CHECKING:
     from tsgt.station import ClientStatus
-    from tsgt.station.serial import OpenPort, Port
 
 DEFAULT_CONFIGS = (Path("/etc/tsgt/client.toml"), Path("/etc/tsgt/master.toml"))
 
@@ -98,14 +98,6 @@ def this_machine() -> Machine:
 
         return serial_port.latency_timer_ms(path)
 
-    def open_port(path: Path) -> OpenPort:
-        from tsgt.station.serial import serial_port
-
-        async def at(baud: int) -> Port:
-            return await serial_port.open_serial_port(path, baud, clock)
-
-        return at
-
     return Machine(
         clock=clock,
         user=current_user(),
@@ -116,7 +108,7 @@ def this_machine() -> Machine:
         free_bytes=free_bytes,
         port_holder=port_holder,
         latency_timer_ms=latency_timer_ms,
-        open_port=open_port,
+        open_port=lambda port: instrument_line(port, clock),
         open_hal=open_hal,
         client_status=_client_status,
         serves=_is_served,

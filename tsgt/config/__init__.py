@@ -25,6 +25,7 @@ from tsgt.config.client import (
     JournalConfig,
     LeicaInstrumentConfig,
     PressureHpa,
+    TcpAddress,
     TemperatureC,
 )
 from tsgt.config.files import (
@@ -127,6 +128,7 @@ __all__ = [
     "StreamConfig",
     "SuperframeConfig",
     "SuperframeMasterConfig",
+    "TcpAddress",
     "TemperatureC",
     "WiringConfig",
     "check_permissions",

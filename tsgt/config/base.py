@@ -20,11 +20,12 @@ Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
 Place = tuple[Coordinate, Coordinate, Coordinate]
 
 
-def _relative_to_file(path: Path, info: ValidationInfo) -> Path:
+def relative_to_file(path: Path, info: ValidationInfo) -> Path:
+    """Return a path of a configuration; a relative one counts from the file's folder."""
     return Path((info.context or {}).get("folder", "")) / path
 
 
-RelativePath = Annotated[Path, AfterValidator(_relative_to_file)]
+RelativePath = Annotated[Path, AfterValidator(relative_to_file)]
 
 
 def rigid(T: Matrix4) -> Matrix4:

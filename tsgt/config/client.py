@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import Field, model_validator
+from pydantic import (
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationInfo,
+    WithJsonSchema,
+    model_validator,
+)
 
-from tsgt.config.base import Model, Positive, RelativePath
+from tsgt.config.base import Model, Positive, RelativePath, relative_to_file
 from tsgt.config.radio import ProtocolConfig, RadioConfig, check_numbers
 
 Baud = Literal[2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600]
@@ -16,6 +26,47 @@ PrismType = Literal["round", "mini", "tape", "360", "mini_360", "mini_zero", "us
 
 TemperatureC = Annotated[float, Field(ge=-60, le=70)]
 PressureHpa = Annotated[float, Field(ge=400, le=1200)]
+
+
+_TCP: Final = re.compile(
+    r"tcp://(?:\[([0-9A-Fa-f:.]+(?:%\w+)?)\]|([A-Za-z0-9_.-]+)):([1-9]\d{0,4})/?", re.ASCII
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TcpAddress:
+    """Address of an instrument, or of the device server that its serial line is connected to."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"tcp://[{self.host}]:{self.port}" if ":" in self.host else f"tcp://{self.host}:{self.port}"
+
+
+def _instrument_port(value: object, info: ValidationInfo) -> Path | TcpAddress:
+    """Return the address of ``tcp://HOST:PORT``, or the path of a device."""
+    if isinstance(value, TcpAddress):
+        return value
+    if not isinstance(value, str | os.PathLike):
+        raise ValueError("expected the path of a serial device, or tcp://HOST:PORT")  # noqa: TRY004 (pydantic expects it)
+    text = os.fspath(value)
+    if "://" not in text:
+        return relative_to_file(Path(text), info)
+    match = _TCP.fullmatch(text)
+    if match is None or int(match[3]) >= 1 << 16:
+        raise ValueError(
+            f"{text}: expected tcp://HOST:PORT, for example tcp://192.168.1.10:1212, or tcp://[IPv6]:PORT"
+        )
+    return TcpAddress(match[1] or match[2], int(match[3]))
+
+
+InstrumentPort = Annotated[
+    Path | TcpAddress,
+    PlainValidator(_instrument_port),
+    PlainSerializer(str),
+    WithJsonSchema({"type": "string"}),
+]
 
 
 class AtmosphereConfig(Model):
@@ -28,14 +79,14 @@ class AtmosphereConfig(Model):
 
 
 class LeicaInstrumentConfig(Model):
-    """A Leica total station that speaks GeoCOM over a serial line: TPS1200+, TS15, TS16, TS30, TS60, MS50, MS60, ..."""
+    """A Leica total station that speaks GeoCOM over a serial line or TCP: TPS1200+, TS15, TS16, TS30, TS60, MS50, MS60, ..."""
 
     kind: Literal["leica"]
-    """A Leica instrument on a serial line."""
-    port: RelativePath
-    """Serial device, preferably a name under /dev/serial/by-id/, which does not change when it is plugged in again."""
+    """A Leica instrument."""
+    port: InstrumentPort
+    """Serial device, preferably its name under /dev/serial/by-id/, which never changes; or ``tcp://HOST:PORT``, with less exact times."""
     baud: Baud = 115_200
-    """Baud rate set in the instrument; other common rates are tried if it does not respond."""
+    """Baud rate set in the instrument; other common rates are tried if it does not respond. Not for TCP."""
     checksum: bool = False
     """Whether to add a checksum to every line, for long cables and radio modems; older instruments do not support it."""
     prism_type: PrismType
@@ -45,7 +96,7 @@ class LeicaInstrumentConfig(Model):
     distance_mode: Literal["auto", "continuous_fast", "continuous_dynamic", "synchro"] = "auto"
     """Distance mode while tracking; "auto" selects the fastest that the instrument accepts."""
     latency_ms: Annotated[float, Field(ge=0, le=1000)] | None = None
-    """Latency from a measurement to the fastest response, subtracted from each timestamp; default: that of the model, or 0."""
+    """Latency from a measurement to the fastest response, without a network, subtracted from each timestamp; default: that of the model, or 0."""
     angle_delay_ms: Annotated[float, Field(ge=-100, le=100)] | None = None
     """Delay of the angles after the distance; recorded, not corrected. Default: that of the model, or 0."""
     atmosphere: AtmosphereConfig | None = None

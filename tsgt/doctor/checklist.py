@@ -6,13 +6,13 @@ from functools import partial
 from inspect import isawaitable
 from typing import TYPE_CHECKING
 
-from tsgt.config import ClientConfig, LeicaInstrumentConfig, MasterConfig
+from tsgt.config import ClientConfig, LeicaInstrumentConfig, MasterConfig, TcpAddress
 from tsgt.doctor import computer, files, radio, serial_line
 from tsgt.doctor.finding import Finding, failed, note, ok, skipped
 from tsgt.doctor.imu import check_imu
 from tsgt.doctor.instrument import DaemonState, check_instrument
 from tsgt.doctor.odometry import check_odometry
-from tsgt.doctor.outgoing import check_alarms, check_geofence_commands
+from tsgt.doctor.outgoing import check_alarms, check_geofence_commands, check_instrument_network
 from tsgt.errors import TsgtError
 
 if TYPE_CHECKING:
@@ -88,12 +88,15 @@ def _client_checks(
     instrument = config.instrument
     if isinstance(instrument, LeicaInstrumentConfig):
         port = instrument.port
-        yield "serial_port", partial(serial_line.check_serial_port, machine, port, user)
-        yield (
-            "serial_port_free",
-            partial(serial_line.check_serial_port_free, machine, port, daemon=daemon.running),
-        )
-        yield "latency_timer", partial(serial_line.check_latency_timer, machine, port)
+        if isinstance(port, TcpAddress):
+            yield "instrument_network", partial(check_instrument_network, port, service)
+        else:
+            yield "serial_port", partial(serial_line.check_serial_port, machine, port, user)
+            yield (
+                "serial_port_free",
+                partial(serial_line.check_serial_port_free, machine, port, daemon=daemon.running),
+            )
+            yield "latency_timer", partial(serial_line.check_latency_timer, machine, port)
     yield "instrument", partial(check_instrument, machine, instrument, daemon)
     yield from _common_checks(machine, path, config, service, daemon)
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tsgt.config import BridgeInstrumentConfig, LeicaInstrumentConfig
+from tsgt.config import BridgeInstrumentConfig, LeicaInstrumentConfig, TcpAddress
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.doctor.serial_line import line_holder
 from tsgt.errors import InstrumentError
@@ -113,6 +113,8 @@ def _without_response(number: int) -> list[Finding]:
 
 def _unreachable_reason(machine: Machine, config: LeicaInstrumentConfig) -> str | None:
     """Return the reason why the line cannot be opened, if a check of the line has reported it already."""
+    if isinstance(config.port, TcpAddress):
+        return None
     if not config.port.exists():
         return "the serial device does not exist"
     if not machine.user.may_use(config.port.resolve()):
@@ -122,7 +124,7 @@ def _unreachable_reason(machine: Machine, config: LeicaInstrumentConfig) -> str 
     return None
 
 
-def check_identity(identity: Identity, config: LeicaInstrumentConfig, baud: int) -> Finding:
+def check_identity(identity: Identity, config: LeicaInstrumentConfig, baud: int | None) -> Finding:
     """Check model and capabilities of the instrument."""
     text = (
         f"{identity.model or 'nameless'}, number {identity.serial_number or 'unknown'}, "
@@ -133,6 +135,8 @@ def check_identity(identity: Identity, config: LeicaInstrumentConfig, baud: int)
             "instrument",
             f"{text}: without automatic target recognition (ATR) it cannot track a prism; use another instrument",
         )
+    if baud is None:
+        return ok("instrument", f"{text}, responds at {config.port}")
     if baud != config.baud:
         return note(
             "instrument",

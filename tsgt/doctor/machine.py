@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tsgt.clock import Clock
+    from tsgt.config import TcpAddress
     from tsgt.radio.sx127x import Hal, Wiring
     from tsgt.service import StartProgram
     from tsgt.station import ClientStatus
@@ -85,7 +86,7 @@ class Machine:
     free_bytes: Callable[[Path], int]
     port_holder: Callable[[Path], str | None]
     latency_timer_ms: Callable[[Path], int | None]
-    open_port: Callable[[Path], OpenPort]
+    open_port: Callable[[Path | TcpAddress], OpenPort]
     open_hal: Callable[[Wiring], Hal]
     client_status: Callable[[Path], ClientStatus | None]
     serves: Callable[[Path], bool]

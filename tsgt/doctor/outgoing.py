@@ -1,4 +1,4 @@
-"""Checks of what the master starts and calls when something happens: commands of geofences and alarms, and the webhook."""
+"""Checks of the daemons' network, and of what the master starts and calls: commands of geofences and alarms, webhook."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from tsgt.doctor.finding import failed, note, ok
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from tsgt.config import AlarmsConfig, GeofenceConfig
+    from tsgt.config import AlarmsConfig, GeofenceConfig, TcpAddress
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine
 
 _HIDDEN = (Path("/home"), Path("/root"), Path("/run/user"))  # from a unit with ProtectHome=yes
+_CLIENT_DROP_IN = "/etc/systemd/system/tsgt-client.service.d/network-instrument.conf"
 _DROP_IN = "sudo systemctl edit tsgt-master, and add the lines of docs/how-to/send-alarms.md, step 2"
 
 
@@ -48,6 +49,17 @@ def check_alarms(
     if config is not None and config.webhook is not None:
         found.append(_check_webhook(machine, config.webhook, service))
     return found
+
+
+def check_instrument_network(address: TcpAddress, service: Mapping[str, str] | None) -> Finding:
+    """Check that the service may connect to an instrument in the network."""
+    if service is not None and is_installed(service) and (denied := _denied_network(service)):
+        return failed(
+            "instrument_network",
+            f"the sandbox of the service denies the network ({denied}): sudo install -D -m 644"
+            f" configs/systemd/network-instrument.conf {_CLIENT_DROP_IN}, then sudo systemctl daemon-reload",
+        )
+    return ok("instrument_network", f"the client may connect to {address}")
 
 
 def _why_not_started(machine: Machine, command: Sequence[str], service: Mapping[str, str] | None) -> str:

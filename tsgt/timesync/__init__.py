@@ -1,13 +1,14 @@
 """All clock models of the system: whose clock follows whose, with offset, skew, and bound. Sans-I/O; at most numpy.
 
 In: timestamps of one-way messages, two-way exchanges, or an instrument's responses. Out: times on the other clock with
-sigma and bound. The station uses `beacon_clock` (the master's session time) and `instrument_clock`; the master uses
-`two_way` (a station's clock), `link_delay`, and `periodicity`. All build on `clock_line`.
+sigma and bound. The station uses `beacon_clock` (the master's session time), `instrument_clock` (the instrument's over a serial line) and
+`exchange_clock` (over a network); the master uses `two_way` (a station's clock), `link_delay`, and `periodicity`. All build on `clock_line`.
 """
 
 from tsgt.timesync.beacon_clock import MAX_SAMPLES, BeaconClock
 from tsgt.timesync.envelope import fit_lower_envelope
-from tsgt.timesync.instrument_clock import MAX_DELAY_NS, InstrumentClock
+from tsgt.timesync.exchange_clock import ExchangeClock
+from tsgt.timesync.instrument_clock import MAX_DELAY_NS, HostTime, InstrumentClock
 from tsgt.timesync.link_delay import LinkDelayEstimator
 from tsgt.timesync.periodicity import Period, Periodicity
 
@@ -15,6 +16,8 @@ __all__ = [
     "MAX_DELAY_NS",
     "MAX_SAMPLES",
     "BeaconClock",
+    "ExchangeClock",
+    "HostTime",
     "InstrumentClock",
     "LinkDelayEstimator",
     "Period",

@@ -84,7 +84,7 @@ def fit_lower_envelope(
     max_slope
         Bound of the slope's magnitude.
     """
-    corners = _lower_hull(points)
+    corners = lower_hull(points)
     prior_slope, prior_sigma = prior
     low, high = -max_slope, max_slope
     for _ in range(_MAX_REFINEMENTS):
@@ -115,7 +115,7 @@ def fit_lower_envelope(
     return LowerEnvelope(height, slope, sigma, pivot, pivot_sigma)
 
 
-def _lower_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def lower_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Return the lower convex hull from left to right (monotone chain: Andrew 1979)."""
     corners: list[tuple[float, float]] = []
     for x, y in sorted(points):

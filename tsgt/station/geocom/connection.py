@@ -35,6 +35,7 @@ _RESPONSE_TIMEOUT_S: Final = 1.0  # above the longest pause of a healthy instrum
 _BAUD_TIMEOUT_S: Final = 0.5  # two in turn: the configured baud rate is tried every second
 _ABORT_TIMEOUT_S: Final = 5.0  # a turning telescope has to stop
 _PROBE_INTERVAL_S: Final = 4.0  # only searches take longer
+_NETWORK_DELAY_S: Final = 2.0  # added to every timeout over a network: bursts and repeated packets of a Wi-Fi
 _PAUSE_S: Final = 0.05
 _WAKE_UP_S: Final = 0.5
 
@@ -121,6 +122,14 @@ class GeoComConnection:
     def __init__(self, port: Port, clock: Clock, *, checksum: bool = False) -> None:
         self.port = port
         self.decimals = 10
+        self.over_network = port.baud is None
+        self._delay_s = _NETWORK_DELAY_S if self.over_network else 0.0
+        self._check = (
+            "check the network between them"
+            if self.over_network
+            else "check that it is on and the cable plugged in"
+        )
+        self._speaks_geocom = self._received = False
         self._clock = clock
         self._checksum = checksum
         self._lines = ReplyLines(port.baud)
@@ -160,11 +169,12 @@ class GeoComConnection:
         if got is _Failure.LOST:
             raise InstrumentError(
                 f"{self.port.name}: the reply to {rpc.name} was lost, or the instrument was switched off and on;"
-                " check cable and plugs"
+                f" {self._check}"
             )
         what = "no reply" if got is _Failure.SILENCE else "only damaged replies"
         raise InstrumentError(
-            f"{self.port.name}: {what} from the instrument to {rpc.name} within {timeout_s:g} s; check cable and plugs"
+            f"{self.port.name}: {what} from the instrument to {rpc.name} within {timeout_s + self._delay_s:g} s;"
+            f" {self._check}"
         )
 
     async def abort(self) -> None:
@@ -201,13 +211,39 @@ class GeoComConnection:
         """Close the port; the instrument continues its procedure."""
         await self.port.close()
 
+    async def greet(self) -> None:
+        """Wait until the instrument at the other end of a network connection responds.
+
+        Aborts a search that an earlier client has started, which keeps it from responding. Raises InstrumentError if it
+        does not respond, or something else does.
+        """
+        lost = ""
+        try:
+            for abort in (False, False, True):
+                if await self.is_responding(abort=abort):
+                    return
+        except InstrumentError as error:
+            if self._speaks_geocom or not self._received:
+                raise
+            lost = " and closed the connection"
+            cause: InstrumentError | None = error
+        else:
+            cause = None
+        if self._received and not self._speaks_geocom:
+            raise InstrumentError(
+                f"{self.port.name}: something else than an instrument answers there{lost}: check address and port, and that"
+                " its interface is set to GeoCOM"
+            ) from cause
+        raise InstrumentError(
+            f"{self.port.name}: connected, but no instrument responds; check that it is on, that its interface is set to"
+            " GeoCOM, and that no other program is connected to it"
+        )
+
     async def _resynchronise(self) -> None:
         for abort in (False, False, True):
             if await self.is_responding(abort=abort):
                 return
-        raise InstrumentError(
-            f"{self.port.name}: the instrument does not respond any more; check that it is on and the cable plugged in"
-        )
+        raise InstrumentError(f"{self.port.name}: the instrument does not respond any more; {self._check}")
 
     async def _await_pending(self) -> None:
         """Await the reply to the request of a cancelled call."""
@@ -217,7 +253,7 @@ class GeoComConnection:
     async def _exchange(
         self, rpc: Rpc, parameters: Sequence[Parameter], timeout_s: float
     ) -> Reply | _Failure:
-        request, now_s = self._request(rpc, parameters), _now_s()
+        request, now_s = self._request(rpc, parameters), _now_s() + self._delay_s
         sent_ns = self._clock.monotonic_ns()
         self._pending = _Pending(self._transaction, sent_ns, now_s + timeout_s, now_s + _PROBE_INTERVAL_S)
         self.port.write(request)
@@ -235,7 +271,7 @@ class GeoComConnection:
 
     def _send_probe(self, pending: _Pending) -> None:
         """Send a request after one that takes long. Replies come in order: when this reply comes first, the other is lost."""
-        pending.probe_s = _now_s() + _PROBE_INTERVAL_S
+        pending.probe_s = _now_s() + self._delay_s + _PROBE_INTERVAL_S
         self.port.write(_CLEAR + self._request(Rpc.COM_NULL_PROC, ()))
         pending.probes.append(self._transaction)
 
@@ -245,7 +281,9 @@ class GeoComConnection:
             try:
                 async with asyncio.timeout_at(min(pending.until_s, pending.probe_s)):
                     while True:
-                        for line in self._lines.push(await self.port.read()):
+                        chunk = await self.port.read()
+                        self._received = True
+                        for line in self._lines.push(chunk):
                             got = self._reply(line, pending)
                             if got is not None:
                                 self._pending = None
@@ -261,6 +299,7 @@ class GeoComConnection:
             reply = decode_reply(line.data, checksum=self._checksum)
         except MessageError:
             return _Failure.DAMAGE
+        self._speaks_geocom = True
         if reply.transaction in pending.probes:
             return _Failure.LOST if not reply.com_code else None
         if reply.transaction != pending.transaction and not (reply.com_code and reply.transaction == 0):
@@ -271,7 +310,7 @@ class GeoComConnection:
 
 
 async def connect(open_port: OpenPort, baud: int, clock: Clock, *, checksum: bool) -> GeoComConnection:
-    """Open a port and find the baud rate at which an instrument responds.
+    """Open a port and find the baud rate at which an instrument responds; a network has none.
 
     ``baud``: tried first, and again between all others. ``checksum``: whether every line carries a checksum. Raises
     InstrumentError if the port cannot be opened, or no instrument responds at any baud rate; that takes ten seconds.
@@ -287,6 +326,9 @@ async def connect(open_port: OpenPort, baud: int, clock: Clock, *, checksum: boo
         opened = port.name
         connection = GeoComConnection(port, clock, checksum=checksum)
         try:
+            if connection.over_network:
+                await connection.greet()
+                return connection
             # A search started by an earlier client keeps the instrument from responding.
             abort = number > 0 and candidate == baud
             responds = await connection.is_responding(abort=abort, timeout_s=_BAUD_TIMEOUT_S)

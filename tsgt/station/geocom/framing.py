@@ -23,13 +23,14 @@ class ReplyLines:
     """Extracts replies from the data of a line.
 
     A reply starts at ``%R1P`` and ends at CR or LF. Data before it is dropped, and so is an incomplete reply that another
-    one interrupts. The arrival of a byte within a chunk follows from the baud rate.
+    one interrupts. The arrival of a byte within a chunk follows from the baud rate; over a network, where
+    there is none, all bytes of a chunk arrive together.
     """
 
     __slots__ = ("_arrivals", "_buffer", "_byte_ns")
 
-    def __init__(self, baud: int) -> None:
-        self._byte_ns = _NS_PER_BYTE_AT_1_BAUD / baud
+    def __init__(self, baud: int | None) -> None:
+        self._byte_ns = _NS_PER_BYTE_AT_1_BAUD / baud if baud is not None else 0.0
         self._buffer = b""
         self._arrivals: list[tuple[int, int]] = []  # end of each chunk in the buffer, and its arrival
 

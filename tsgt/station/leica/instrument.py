@@ -93,8 +93,9 @@ class LeicaInstrument:
         line.decimals = DECIMALS
         before = self._identity
         self._identity = identity = await identify(line, before)
-        if identity.serial_number != before.serial_number:
-            self._timestamper.reset()
+        same_line = self._timestamper.over_network == line.over_network
+        if identity.serial_number != before.serial_number or not same_line:
+            self._timestamper.reset(over_network=line.over_network)
             if identity.robotic is False:
                 log.warning("licence_missing")
         latency_ms = self._config.latency_ms
@@ -259,6 +260,8 @@ class LeicaInstrument:
                 problems.insert(0, tracking.operator_request)
             if tracking.tilted:
                 problems.insert(0, "it is not level")
+        if self._timestamper.problem:
+            problems.append(self._timestamper.problem)
         if self._identity.power_problem:
             problems.append(self._identity.power_problem)
         if self._line is not None and not may_search:

@@ -13,12 +13,13 @@ from tsgt.service import LogLimiter
 from tsgt.station.geocom import Rpc
 from tsgt.station.leica.identity import numeric_values
 from tsgt.station.leica.measurement import MAX_TIME_MS, Timestamp
-from tsgt.timesync import InstrumentClock
+from tsgt.timesync import ExchangeClock, InstrumentClock
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.station.geocom import GeoComConnection
     from tsgt.station.leica.measurement import FullMeasurement
+    from tsgt.timesync import HostTime
 
 log = structlog.get_logger()
 
@@ -27,7 +28,8 @@ _MIN_FIRST_EXCHANGES: Final = 12
 _MAX_EXCHANGES: Final = 24
 _SYNCHRONISATION_NS: Final = 1_000_000_000
 _SYNCHRONISED_SIGMA_NS: Final = 1_000_000
-"""The first synchronisation ends when times are known to this sigma, or after this duration."""
+"""The first synchronisation ends when times are known to this sigma, or after this duration; over a network, where delays
+vary more, each one when they are known well enough to be used, or after three times the duration."""
 
 _MAX_FAILURES: Final = 3  # a single reply without a time is not conclusive
 
@@ -45,31 +47,44 @@ _MAX_EXCHANGE_NS: Final = 200_000_000
 _RESERVE_NS: Final = 10_000_000
 """Initial estimate of an exchange's duration, its bound unless the instrument pauses, and the idle time left after it."""
 
+_MAX_NETWORK_SIGMA_NS: Final = 10_000_000
+"""Over a network, distances whose times are known less well are not used: 15 mm at 1.5 m/s."""
+
 _REPEAT_WINDOW_MS: Final = 60_000  # a distance older than the last one by less than this is a repetition
 
 
 class DistanceTimestamper:
-    """Maps the times of one instrument's distances to the host's clock, less ``latency_ns`` to the fastest reply."""
+    """Maps the times of one instrument's distances to the host's clock, less ``latency_ns`` to the fastest reply.
+
+    Over a network, the delay of the fastest reply is not known: the time is bounded by the requests and the replies.
+    ``over_network``: whether this instrument is behind one. ``problem``: why distances are not used; empty if they are.
+    """
 
     def __init__(self, latency_ns: int) -> None:
         self.latency_ns = latency_ns
-        self._clock_fit = InstrumentClock()
+        self.over_network = False
+        self._clock_fit: InstrumentClock | ExchangeClock = InstrumentClock()
+        self.problem = ""
         self._last_ms: int | None = None
         self._log_limiter = LogLimiter()
         self._requested_ns = self._received_ns = 0
         self._exchange_ns = _EXCHANGE_NS
         self._failed = False
 
-    def reset(self) -> None:
+    def reset(self, *, over_network: bool) -> None:
         """Start over with another instrument."""
-        self._clock_fit = InstrumentClock()
+        self.over_network = over_network
+        self._clock_fit = ExchangeClock() if over_network else InstrumentClock()
         self._last_ms = None
+        self.problem = ""
 
     async def synchronise(self, line: GeoComConnection) -> None:
         """Exchange times until the clock fit is good, or it is clear that this takes longer."""
         fit = self._clock_fit
         known = fit.initialised
         min_exchanges = _MIN_EXCHANGES if known else _MIN_FIRST_EXCHANGES
+        sigma_ns = _MAX_NETWORK_SIGMA_NS if self.over_network else _SYNCHRONISED_SIGMA_NS
+        duration_ns = (3 if self.over_network else 1) * _SYNCHRONISATION_NS
         failures = 0
         start_ns: int | None = None
         for number in range(1, _MAX_EXCHANGES + 1):
@@ -77,8 +92,8 @@ class DistanceTimestamper:
             if failures == _MAX_FAILURES:
                 return
             start_ns = self._received_ns if start_ns is None else start_ns
-            expired = self._received_ns - start_ns > _SYNCHRONISATION_NS
-            good = known or fit.sigma_ns < _SYNCHRONISED_SIGMA_NS or expired
+            expired = self._received_ns - start_ns > duration_ns
+            good = (known and not self.over_network) or fit.sigma_ns < sigma_ns or expired
             if number >= min_exchanges and fit.initialised and not fit.inconsistent and good:
                 return
 
@@ -109,7 +124,11 @@ class DistanceTimestamper:
         if values is None or not 0 < abs(values[3]) <= MAX_TIME_MS:
             return False
         resets = self._clock_fit.resets
-        self._clock_fit.add(int(values[3]), reply.first_byte_ns)
+        fit, time_ms = self._clock_fit, int(values[3])
+        if isinstance(fit, ExchangeClock):
+            fit.add(time_ms, reply.sent_ns, max(reply.first_byte_ns - self.latency_ns, reply.sent_ns))
+        else:
+            fit.add(time_ms, reply.first_byte_ns)
         self._report_reset(resets)
         return True
 
@@ -128,12 +147,30 @@ class DistanceTimestamper:
         resets = self._clock_fit.resets
         time = self._clock_fit.timestamp(measured.time_ms, measured.first_byte_ns)
         self._report_reset(resets)
+        if time is not None and self.over_network:
+            return self._over_network_timestamp(time)
         if time is None:
             now_ns = measured.first_byte_ns
             if self._clock_fit.initialised and self._log_limiter.allows("distance_time_rejected", now_ns):
                 log.warning("distance_time_rejected", instrument_ms=measured.time_ms)
             return None
         return Timestamp(max(time.host_ns - self.latency_ns, 0), time.sigma_ns)
+
+    def _over_network_timestamp(self, time: HostTime) -> Timestamp | None:
+        """Return a time unless its uncertainty is too large."""
+        before, self.problem = self.problem, ""
+        if time.sigma_ns > _MAX_NETWORK_SIGMA_NS:
+            self.problem = (
+                f"its distances are not used: their times are known to {time.sigma_ns / 1e6:.0f} ms only, by the fastest"
+                f" replies over the network, and {_MAX_NETWORK_SIGMA_NS / 1e6:.0f} ms are allowed; improve the Wi-Fi, or use"
+                " a cable"
+            )
+            if not before:
+                log.warning("distance_time_uncertain", sigma_ms=round(time.sigma_ns / 1e6, 1))
+            return None
+        if before:
+            log.info("distance_time_certain", sigma_ms=round(time.sigma_ns / 1e6, 1))
+        return Timestamp(time.host_ns, time.sigma_ns)
 
     def _report_reset(self, resets_before: int) -> None:
         if self._clock_fit.resets != resets_before:

@@ -291,7 +291,9 @@ class Tracking:
         self._poll_scheduler.add_distance(time_ms)
         self._last_distance_ns = measured.first_byte_ns
         if time is None:
-            return None
+            if not self._timestamper.problem:
+                return None
+            return self._readings.without_distance(measured._replace(status=Status.ERROR))
         if self.awaits_operator or (self.target_search is not None and self._lock is not Lock.IN):
             return await self._without_distance(measured._replace(status=Status.NO_TARGET))
         if time.at_ns < self._valid_from_ns:

@@ -1,7 +1,8 @@
-"""Serial ports of instruments: the interface, and the real port on tty, pty or USB adapter.
+"""Lines to instruments: the interface, the serial port (tty, pty, USB adapter), and the TCP connection.
 
-In: a device path and a baud rate. Out: data chunks with arrival times. ``serial_port`` is imported from its file and only
-where a real port is opened: it needs pyserial. It also finds out which process holds a port, and the USB adapter's latency.
+In: a device path and a baud rate, or an address. Out: data chunks with arrival times. ``serial_port`` and ``tcp_port`` are
+imported from their files and only where a real line is opened: the former needs pyserial, finds out which process holds a
+port, and the USB adapter's latency.
 """
 
 from tsgt.station.serial.base import Chunk, OpenPort, Port

@@ -1,4 +1,4 @@
-"""The interface of an instrument driver to its serial port, real or simulated."""
+"""The interface of an instrument driver to its line: a serial port or a TCP connection, real or simulated."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Port(Protocol):
         """Name for messages."""
 
     @property
-    def baud(self) -> int:
-        """Bits per second; a byte takes ten bits."""
+    def baud(self) -> int | None:
+        """Bits per second, where a byte takes ten bits; None for a network, whose delays are unknown."""
 
     def write(self, data: bytes) -> None:
         """Queue data for sending; does not wait."""
@@ -37,4 +37,5 @@ class Port(Protocol):
         """Close the port; unsent data is lost."""
 
 
-OpenPort = Callable[[int], Coroutine[Any, Any, Port]]  # opens the port at a baud rate; raises InstrumentError
+OpenPort = Callable[[int], Coroutine[Any, Any, Port]]
+"""Opens the port at a baud rate, which a network ignores; raises InstrumentError."""

@@ -1,0 +1,45 @@
+"""Two hundred faults between a client and its Leica over Wi-Fi: what goes wrong, and how soon it measures again.
+
+python benchmarks/run.py network_faults [KIND]
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from typing import TYPE_CHECKING
+
+import structlog
+from harness.network_scripts import NetworkScript, all_network_scripts, run_network_script
+from measuring import Stopwatch
+
+if TYPE_CHECKING:
+    from harness.serial_scripts import ScriptResult
+
+
+def main() -> None:
+    """Run the scripts, all or those of a kind; print a line for each kind."""
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    only = sys.argv[1] if len(sys.argv) > 1 else ""
+    scripts = [script for script in all_network_scripts() if only in script.kind]
+    results: dict[str, list[tuple[NetworkScript, ScriptResult]]] = {}
+    with Stopwatch() as stopwatch:
+        for script in scripts:
+            results.setdefault(script.kind, []).append((script, run_network_script(script)))
+    print("| fault | scripts | offered | given | wrong | measures again after, median / worst | stated |")
+    print("|---|---|---|---|---|---|---|")
+    for kind, outcomes in results.items():
+        after_s = sorted(outcome.recovery_s for _, outcome in outcomes)
+        offered, given = (
+            sum(getattr(outcome, name) for _, outcome in outcomes) for name in ("offered", "reported")
+        )
+        wrong = sum(len(outcome.violations) for _, outcome in outcomes)
+        print(
+            f"| {kind} | {len(outcomes)} | {offered} | {given} | {wrong} "
+            f"| {after_s[len(after_s) // 2]:.1f} / {after_s[-1]:.1f} s | {outcomes[0][0].limit_s:g} s |"
+        )
+    for kind, outcomes in results.items():
+        for script, outcome in outcomes:
+            for problem in outcome.violations[:3]:
+                print(f"{kind}, seed {script.seed}: {problem}")
+    print(f"{len(scripts)} scripts, {stopwatch.cpu_s:.0f} s of CPU")

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.config import MasterConfig
+    from tsgt.estimation import StartCheck
     from tsgt.master.link_events import LinkStatus
     from tsgt.model import Parameters
     from tsgt.radio import LoRaSettings, Radio, RadioOpener
@@ -88,6 +89,8 @@ class MasterDependencies:
     write: Callable[[int, memoryview], int] | None = None  # see :class:`~tsgt.recording.RecordingWriter`
     disk_status: Callable[[Path], DiskStatus | None] = disk_status
     """Returns the space on the disk of a folder; called in a thread."""
+    start_check: StartCheck | None = None
+    """Starts a check of the IMU's set-up; None: in a thread of its own."""
 
 
 async def run_master(
@@ -151,7 +154,7 @@ async def run_master(
                     ],
                     emit,
                     unix_now_ns,
-                    lambda work: checks.submit(work).result,
+                    dependencies.start_check or (lambda work: checks.submit(work).result),
                 )
                 publisher.put(_setup_record(config, parameters, start_ns, path.name, dependencies.key))
                 link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.config import SuperframeMasterConfig, scenario_parameters
+from tsgt.estimation import start_now
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
 from tsgt.recording import decode
@@ -261,6 +262,7 @@ class Mission:
                     start_odometry=start_odometry,
                     write=computer.new_writer(),
                     disk_status=lambda _folder: computer.disk.status(),
+                    start_check=start_now,  # no other thread: it would break on a look at all objects
                 ),
             ),
         )

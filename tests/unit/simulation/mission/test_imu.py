@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import threading
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from harness.missions import SUPERFRAME, run_mission
 from tsgt.config import ScenarioConfig, SimulatedImu
 from tsgt.estimation import centroid_at_point, imu_setup_monitor
 from tsgt.geometry import log_so3, rotation_from_quaternion, transform_from, transform_points
+from tsgt.geometry.inertial_calibration import SetupCheck
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.imu_samples import imu_failures
@@ -137,6 +139,22 @@ def test_mission_with_few_stations(tmp_path: Path, count: int) -> None:
     path = run.master_logs[0].recording()
     assert path is not None
     assert sum(len(record.stamp_ns) for record in read_imu_samples(path)) > 600
+
+
+def test_setup_is_checked_in_the_thread_of_the_mission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tuple that another thread fills breaks when all objects of the process are listed, as a mission does each minute."""
+    threads = []
+
+    def check(*_: object) -> SetupCheck:
+        threads.append(threading.current_thread())
+        return SetupCheck()
+
+    monkeypatch.setattr(imu_setup_monitor, "FIRST_NS", 1_000_000_000)
+    monkeypatch.setattr(imu_setup_monitor, "check_recorded_setup", check)
+    run_mission(tmp_path, WITH, duration_s=3.0, protocol=SUPERFRAME, seed=0)
+    assert set(threads) == {threading.current_thread()}
 
 
 @pytest.fixture(scope="module")

@@ -19,21 +19,38 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from evo.core import metrics, sync
+from evo.core import trajectory as evo_trajectory
 from measuring import Stopwatch
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from tsgt.analysis.compare import Estimate, FitSettings, ReferencePoses, fit, pair
-from tsgt.geometry import covariance_over_lever_arm, exp_so3, log_so3, rotate, transform_from
+from tsgt.analysis.compare import Estimate, FitSettings, ReferencePoses, Relation, nested_fits, pair
+from tsgt.analysis.compare.drifting_frame import NAMES, Unknowns, linearise, rows_of, solve, start_states
+from tsgt.analysis.compare.errors import nees
+from tsgt.analysis.compare.frame_alignment import FRAME_NAMES
+from tsgt.analysis.compare.interpolation import ReferenceTrajectory
+from tsgt.analysis.compare.pairing import on_reference_clock
+from tsgt.analysis.compare.reference_error import as_white, own_covariance, whiten
+from tsgt.analysis.compare.relative import relative
+from tsgt.geometry import (
+    covariance_over_lever_arm,
+    exp_so3,
+    log_so3,
+    quaternion_from_rotation,
+    rotate,
+    rotation_from_quaternion,
+    transform_from,
+)
 from tsgt.model import ROBOT_ORIGIN
 from tsgt.simulation.estimates import GNSS, LIDAR, VISUAL_INERTIAL, draw_relation, simulate_estimate
 from tsgt.simulation.scenario_files import find_scenario
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
-    from tsgt.analysis.compare import Fit
+    from tsgt.analysis.compare import Fit, PairedPoses
     from tsgt.geometry import FloatArray
-    from tsgt.simulation.estimates import EstimateModel, PoseAt, SimulatedEstimate
+    from tsgt.simulation.estimates import EstimateModel, PoseAt, SimulatedEstimate, TrueRelation
     from tsgt.simulation.world import World
 
 KINDS = {"lidar": LIDAR, "visual-inertial": VISUAL_INERTIAL, "gnss": GNSS}
@@ -106,34 +123,145 @@ def errors(found: Fit, made: SimulatedEstimate) -> dict[str, float]:
     }
 
 
-def one(scenario: str, kind: str, seed: int, duration_s: float) -> dict[str, Any]:
+def frame_errors(relation: Relation, made: SimulatedEstimate) -> dict[str, float]:
+    """Return the errors of the frame by name, at the centroid of the estimate's positions as ``Fit`` defines them."""
+    true = made.truth.T_station1_frame
+    error = relation.T_station1_frame @ np.linalg.inv(true)
+    centroid_m = true[:3, :3] @ made.position_m.mean(axis=0) + true[:3, 3]
+    shift = error[:3, :3] @ centroid_m + error[:3, 3] - centroid_m
+    return dict(zip(FRAME_NAMES, [*shift.tolist(), *log_so3(error[:3, :3]).tolist()], strict=True))
+
+
+def bound(
+    reference: ReferencePoses, estimate: Estimate, model: EstimateModel, truth: TrueRelation
+) -> dict[str, float]:
+    """Return sigmas that no estimator goes below that knows how large all errors are, and how they drift (Cramér-Rao).
+
+    Errors of the reference count as white noise of the same power; without a covariance it is exact.
+    """
+    trajectory = ReferenceTrajectory(reference)
+    relation = Relation(truth.offset_s, 0.0, truth.T_robot_sensor, truth.T_station1_frame, 1.0)
+    stamp_ns = on_reference_clock(estimate, relation)
+    rows = rows_of(estimate, trajectory.covers(stamp_ns), 1e-6)
+    R, arm_m = truth.T_robot_sensor[:3, :3], truth.T_robot_sensor[:3, 3]
+    given = Unknowns(truth.offset_s, 0.0, 1.0, arm_m, R, np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    at = start_states(trajectory, rows, given, truth.T_station1_frame[:3, :3])
+    linear = linearise(trajectory, rows, at)
+    jitter = model.stamp_jitter_s**2 * (linear.pose_by_border[:, :, 0] ** 2).mean(axis=0)
+    white = np.repeat([model.position_noise_m**2, model.rotation_noise_rad**2], 3) + jitter
+    stationary = np.array(
+        [model.horizontal_error_m] * 2 + [model.vertical_error_m] + [model.tilt_error_rad] * 2 + [0.0]
+    )
+    walk_per_m = np.array([model.position_walk_m] * 3 + [model.tilt_walk_rad] * 2 + [model.yaw_walk_rad]) ** 2
+    driven_m = np.linalg.norm(np.diff(rows.position_m[rows.knot], axis=0), axis=1)[:, None]
+    walk = 2.0 * stationary**2 / model.correlation_time_s * rows.step_s[:, None] + walk_per_m * driven_m
+    covariance = own_covariance(trajectory, stamp_ns, trajectory.covers(stamp_ns))
+    if covariance is not None:
+        covariance = as_white(covariance[rows.row], float(np.median(np.diff(rows.since_first_s))))
+    whitening = whiten(linear.pose, white, covariance, linear.arm_m, has_orientation=model.orientation).matrix
+    whitening = whitening * linear.known[:, None, None]
+    active = [0, 3, 4, 5] + ([6, 7, 8] if model.orientation else [])
+    zero = (np.zeros(len(NAMES)), np.zeros(len(NAMES)))
+    solved = solve(rows, linear, whitening, 1.0 / (walk + 1e-12), active, zero)
+    sigma = np.sqrt(np.diag(np.linalg.inv(solved.information)))
+    return {NAMES[i]: float(value) for i, value in zip(active, sigma, strict=True)}
+
+
+def evo_figures(
+    reference: ReferencePoses, estimate: Estimate, truth: TrueRelation, pairs: PairedPoses
+) -> dict[str, float]:
+    """Return evo's ATE of the estimate against the reference, aligned, with no offset and with the true one, and of our pairs."""
+
+    def trajectory(stamp_ns: Any, position_m: FloatArray, rotation: FloatArray) -> Any:
+        xyzw = quaternion_from_rotation(rotation)
+        return evo_trajectory.PoseTrajectory3D(
+            position_m, np.roll(xyzw, 1, axis=1), (stamp_ns - START_NS) / 1e9
+        )
+
+    def rmse(metric: Any, first: Any, second: Any) -> float:
+        metric.process_data((first, second))
+        return float(metric.get_statistic(metrics.StatisticsType.rmse))
+
+    part = metrics.PoseRelation.translation_part
+    T = reference.T_station1_point
+    theirs = trajectory(reference.stamp_ns, T[:, :3, 3], T[:, :3, :3])
+    own = np.tile(np.eye(3), (len(estimate.stamp_ns), 1, 1))
+    if estimate.orientation_xyzw is not None:
+        own = rotation_from_quaternion(estimate.orientation_xyzw)
+    found = {}
+    for name, offset_s in (("ape_m", 0.0), ("ape_known_offset_m", truth.offset_s)):
+        stamp_ns = estimate.stamp_ns + round(offset_s * 1e9)
+        associated = sync.associate_trajectories(
+            theirs, trajectory(stamp_ns, estimate.position_m, own), max_diff=0.03
+        )
+        associated[1].align(associated[0])
+        found[name] = rmse(metrics.APE(part), *associated)
+    same = [
+        trajectory(pairs.stamp_ns, each[:, :3, 3], each[:, :3, :3])
+        for each in (pairs.reference, pairs.estimated)
+    ]
+    found["same_pairs_ape_m"] = rmse(metrics.APE(part), *same)
+    found["same_pairs_rpe_m"] = rmse(metrics.RPE(part, 10.0, metrics.Unit.meters), *same)
+    return found
+
+
+def one(scenario: str, kind: str, seed: int, duration_s: float, *, with_evo: bool) -> dict[str, Any]:
     """Fit one estimate; returns errors and sigmas."""
-    reference, exact, made = simulated(scenario, KINDS[kind], seed, duration_s)
-    estimate = Estimate(kind, made.stamp_ns, made.position_m, made.orientation_xyzw, None)
+    model = KINDS[kind]
+    reference, exact, made = simulated(scenario, model, seed, duration_s)
+    estimate = Estimate(kind, made.stamp_ns, made.position_m, made.orientation_xyzw, made.covariance)
     settings = FitSettings(frozenset({"offset", "extrinsic", "frame"}), "rigid")
     with Stopwatch() as stopwatch:
-        found = fit(reference, estimate, settings)
-    sigma = dict(zip(found.names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+        nested = nested_fits(reference, estimate, settings)
+    (_, start), (_, found) = nested[-2:]
+    sigma = _sigmas(found)
     error = {name: value for name, value in errors(found, made).items() if name in sigma}
-    ate_m, exact_ate_m = (_ate_m(each, estimate, found) for each in (reference, exact))
-    return {
+    pairs, exact_pairs = (pair(each, estimate, found.relation) for each in (reference, exact))
+    normalised = {
+        align: nees(each)
+        for align, each in (("start", pair(reference, estimate, start.relation)), ("rigid", pairs))
+    }
+    result = {
         "scenario": scenario,
         "kind": kind,
         "seed": seed,
         "error": error,
         "sigma": {name: sigma[name] for name in error},
+        "bound": bound(reference, estimate, model, made.truth),
+        "bound_exact": bound(exact, estimate, model, made.truth),
+        "frame": {
+            align: {
+                name: [value, _sigmas(each)[name]]
+                for name, value in frame_errors(each.relation, made).items()
+                if name in each.names
+            }
+            for align, each in (("start", start), ("rigid", found))
+        },
+        "nees": {a: each.statistics.mean / each.degrees_of_freedom for a, each in normalised.items() if each},
         "unobservable": found.unobservable,
         "used": float(found.used.mean()),
-        "ate_m": ate_m,
-        "exact_ate_m": exact_ate_m,
+        "ate_m": _ate_m(pairs),
+        "exact_ate_m": _ate_m(exact_pairs),
         "true_ate_m": made.ate_position_m("rigid"),
         "cpu_s": stopwatch.cpu_s,
     }
+    if with_evo:
+        result["evo"] = evo_figures(reference, estimate, made.truth, pairs)
+        (rpe,) = [
+            each
+            for each in relative(pairs)
+            if (each.delta, each.unit, each.pairs) == (10.0, "m", "consecutive")
+        ]
+        result["rpe_m"] = rpe.judged.errors.position_mm.rms / 1e3
+    return result
 
 
-def _ate_m(reference: ReferencePoses, estimate: Estimate, found: Fit) -> float:
-    paired = pair(reference, estimate, found.relation)
-    return _rms(np.linalg.norm(paired.estimated[:, :3, 3] - paired.reference[:, :3, 3], axis=1))
+def _sigmas(found: Fit) -> dict[str, float]:
+    return dict(zip(found.names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+
+
+def _ate_m(pairs: PairedPoses) -> float:
+    return _rms(np.linalg.norm(pairs.estimated[:, :3, 3] - pairs.reference[:, :3, 3], axis=1))
 
 
 def summary(results: list[dict[str, Any]]) -> str:
@@ -189,12 +317,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--duration", type=float, default=300.0)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--evo", type=int, default=0, help="Number of seeds with evo's figures, too.")
     options = parser.parse_args()
     results = []
     for scenario in options.scenarios:
         for kind in options.kinds:
             seeds = range(options.first, options.first + options.seeds)
-            own = [one(scenario, kind, seed, options.duration) for seed in seeds]
+            own = [
+                one(scenario, kind, seed, options.duration, with_evo=seed < options.first + options.evo)
+                for seed in seeds
+            ]
             results += own
             print(summary(own), flush=True)
     if options.json is not None:

@@ -20,6 +20,7 @@ from tsgt.geometry import (
     quaternion_from_rotation,
     rotate,
     rotation_from_quaternion,
+    skew,
     transform_from,
 )
 
@@ -154,6 +155,7 @@ class SimulatedEstimate:
     stamp_ns: NDArray[np.int64]  # (M,) on the clock of that program, strictly increasing
     position_m: FloatArray  # (M, 3) in its frame
     orientation_xyzw: FloatArray | None  # (M, 4)
+    covariance: FloatArray  # (M, 6, 6) of its errors by the model, in its frame, order as in PoseBatch
     truth: TrueRelation
     T_station1_estimated: FloatArray  # (M, 4, 4) by the true relation; of positions alone, the true rotation
     T_station1_sensor: FloatArray  # (M, 4, 4) truth
@@ -229,10 +231,12 @@ def simulate_estimate(
     stamped_s, estimated = stamped_s[kept], estimated[kept]
     elapsed_s = (stamped_s - stamped_s[0]) / (1.0 + truth.skew)
     in_frame = invert(truth.T_station1_frame) @ estimated
+    into = np.kron(np.diag([1.0 / truth.scale, 1.0]), truth.T_station1_frame[:3, :3].T)
     return SimulatedEstimate(
         start_ns + np.rint((stamped_s[0] - truth.offset_s + elapsed_s) * SECOND_NS).astype(np.int64),
         in_frame[:, :3, 3] / truth.scale,
         quaternion_from_rotation(in_frame[:, :3, :3]) if model.orientation else None,
+        into @ _covariance(model, time_s, sensor)[kept] @ into.T,
         truth,
         estimated,
         pose_at(stamped_s) @ truth.T_robot_sensor,
@@ -268,6 +272,35 @@ def _with_errors(
     tilt[:, :2] = model.tilt_error_rad * markov[:, 3:5]
     rotation = exp_so3(tilt) @ turned @ true[:, :3, :3] @ exp_so3(model.rotation_noise_rad * whites[:, 3:])
     return transform_from(rotation, position)
+
+
+def _covariance(model: EstimateModel, time_s: FloatArray, true: FloatArray) -> FloatArray:
+    """Covariance of the errors by the model, (N, 6, 6), without dropouts, divergence and jumps; stamps count by the mean velocity."""
+    n = len(time_s)
+    position = true[:, :3, 3]
+    steps_m = np.diff(position, axis=0)
+    driven_m = np.concatenate([[0.0], np.linalg.norm(steps_m, axis=1)])
+    turned = np.diag([model.tilt_walk_rad, model.tilt_walk_rad, model.yaw_walk_rad]) ** 2
+    # A turn where the sensor was at p_k has moved it at p by dθ x (p - p_k): sums over all k before.
+    arms = skew(position)
+    path_m = np.cumsum(driven_m)[:, None, None]
+    first = np.cumsum(driven_m[:, None, None] * arms, axis=0)
+    second = np.cumsum(driven_m[:, None, None] * (arms @ turned @ np.swapaxes(arms, 1, 2)), axis=0)
+    across = arms @ turned @ np.swapaxes(first, 1, 2)
+    found = np.zeros((n, 6, 6))
+    found[:, :3, :3] = path_m * (arms @ turned @ np.swapaxes(arms, 1, 2)) + second
+    found[:, :3, :3] -= across + np.swapaxes(across, 1, 2)
+    found[:, :3, :3] += (path_m * model.position_walk_m**2 + model.position_noise_m**2) * np.eye(3)
+    stationary = np.diag([model.horizontal_error_m, model.horizontal_error_m, model.vertical_error_m]) ** 2
+    velocity_mps = np.gradient(position, time_s, axis=0)
+    found[:, :3, :3] += (
+        stationary + model.stamp_jitter_s**2 * velocity_mps[:, :, None] * velocity_mps[:, None, :]
+    )
+    found[:, :3, 3:] = (first - path_m * arms) @ turned
+    found[:, 3:, :3] = np.swapaxes(found[:, :3, 3:], 1, 2)
+    tilted = np.diag([model.tilt_error_rad, model.tilt_error_rad, 0.0]) ** 2
+    found[:, 3:, 3:] = path_m * turned + tilted + model.rotation_noise_rad**2 * np.eye(3)
+    return found
 
 
 def _gauss_markov(model: EstimateModel, white: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tsgt.config import ScenarioConfig
-from tsgt.geometry import invert, rotation_from_quaternion, transform_from
+from tsgt.geometry import invert, log_so3, rotation_from_quaternion, transform_from
 from tsgt.simulation.estimates import (
     GNSS,
     LIDAR,
@@ -71,6 +71,37 @@ def test_drift_is_that_of_published_methods(model: EstimateModel, percent: float
         error = invert(invert(true[0]) @ true[200]) @ (invert(estimated[0]) @ estimated[200])
         errors_m.append(np.linalg.norm(error[:3, 3]))
     assert 100.0 * np.mean(errors_m) / 400.0 == pytest.approx(percent, rel=0.25)
+
+
+@pytest.mark.parametrize("model", [LIDAR, VISUAL_INERTIAL, GNSS])
+def test_stated_covariance_is_that_of_the_errors(model: EstimateModel) -> None:
+    """NEES over seeds at the end of a bent drive, where drift of the rotation has bent the path: as of chi-square."""
+
+    def bend(time_s: np.ndarray) -> np.ndarray:
+        at_m = np.column_stack([30.0 * np.sin(0.05 * time_s), 2.0 * time_s, 0.05 * time_s])
+        return transform_from(np.eye(3), at_m)
+
+    model = replace(model, rate_hz=2.0, dropouts_per_min=0.0)
+    squares = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        relation = replace(draw_relation(model, rng), T_robot_sensor=np.eye(4))
+        found = simulate_estimate(model, relation, bend, 60.0, rng)
+        R = relation.T_station1_frame[:3, :3]
+        error = (
+            np.concatenate(
+                [
+                    found.T_station1_estimated[-1, :3, 3] - found.T_station1_sensor[-1, :3, 3],
+                    log_so3(found.T_station1_estimated[-1, :3, :3]),
+                ]
+            ).reshape(2, 3)
+            @ R
+        )
+        size = 6 if model.orientation else 3
+        covariance = found.covariance[-1, :size, :size]
+        squares.append(error.ravel()[:size] @ np.linalg.solve(covariance, error.ravel()[:size]) / size)
+    # The mean of 100 has a sigma of at most 0.08.
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.25)
 
 
 def test_gravity_keeps_the_tilt() -> None:

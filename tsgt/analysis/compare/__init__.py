@@ -21,12 +21,19 @@ from tsgt.analysis.compare.comparison import (
 from tsgt.analysis.compare.completeness import Completeness
 from tsgt.analysis.compare.error_table import error_csv
 from tsgt.analysis.compare.errors import TRAVEL_COMPONENTS, ErrorSeries, JudgedErrors
-from tsgt.analysis.compare.fitting import ExtrinsicPrior, FitSettings, fit, nested_fits
+from tsgt.analysis.compare.fitting import fit, nested_fits
 from tsgt.analysis.compare.initialisation import overlap_s
 from tsgt.analysis.compare.pairing import PairedPoses, pair
-from tsgt.analysis.compare.reference_point import reference_at
-from tsgt.analysis.compare.relation import Alignment, Fit, FittedPart, Relation, initial_relation
-from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
+from tsgt.analysis.compare.relation import (
+    Alignment,
+    ExtrinsicPrior,
+    Fit,
+    FitSettings,
+    FittedPart,
+    Relation,
+    initial_relation,
+)
+from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses, reference_at
 
 __all__ = [
     "TRAVEL_COMPONENTS",

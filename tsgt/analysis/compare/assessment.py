@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from tsgt.analysis.compare.completeness import Completeness, completeness
 from tsgt.analysis.compare.errors import ErrorSeries, JudgedErrors, Nees, absolute, error_series, nees
-from tsgt.analysis.compare.pairing import PairedPoses, on_reference_clock, pair
+from tsgt.analysis.compare.pairing import on_reference_clock
 from tsgt.analysis.compare.relative import Drift, RelativePoseErrors, drift, relative
 from tsgt.errors import GeometryError
 
 if TYPE_CHECKING:
+    from tsgt.analysis.compare.pairing import PairedPoses, Pairing
     from tsgt.analysis.compare.relation import Relation
-    from tsgt.analysis.compare.trajectories import Estimate, ReferencePoses
     from tsgt.analysis.evaluation import Bins
 
 MIN_POSES = 2
@@ -57,11 +57,9 @@ def _bins(found: Bins | None) -> dict[str, Any] | None:
     }
 
 
-def paired(
-    reference: ReferencePoses, estimate: Estimate, relation: Relation, *, max_sigma_m: float | None = None
-) -> PairedPoses:
-    """Pair as :func:`pair`. Raises GeometryError if fewer than two poses have a reference."""
-    pairs = pair(reference, estimate, relation, max_sigma_m=max_sigma_m)
+def paired(pairing: Pairing, relation: Relation) -> PairedPoses:
+    """Pair under a relation. Raises GeometryError if fewer than two poses have a reference."""
+    pairs = pairing.under(relation)
     if len(pairs.row) < MIN_POSES:
         raise GeometryError(
             f"of {pairs.n_estimate} poses {len(pairs.row)} can be compared: {pairs.n_outside} are before or after the reference, "
@@ -71,13 +69,7 @@ def paired(
 
 
 def assess(
-    reference: ReferencePoses,
-    estimate: Estimate,
-    relation: Relation,
-    *,
-    aligned: bool,
-    fair: Relation | None = None,
-    max_sigma_m: float | None = None,
+    pairing: Pairing, relation: Relation, *, aligned: bool, fair: Relation | None = None
 ) -> Assessment:
     """Compute all errors of an estimate.
 
@@ -90,27 +82,25 @@ def assess(
         then does not show in the errors.
     fair
         Relation under which jumps and divergence are found, if another: without the extrinsic, every turn is a jump.
-    max_sigma_m
-        Instants at which the reference is less certain than this are left out.
 
     Raises
     ------
     GeometryError
         Fewer than two poses have a reference.
     """
-    pairs = paired(reference, estimate, relation, max_sigma_m=max_sigma_m)
+    pairs = paired(pairing, relation)
     series = error_series(pairs)
     fair_pairs, fair_series = pairs, series
     if fair is not None and fair is not relation:
-        fair_pairs = paired(reference, estimate, fair, max_sigma_m=max_sigma_m)
+        fair_pairs = paired(pairing, fair)
         fair_series = error_series(fair_pairs)
-    stamp_ns = on_reference_clock(estimate, relation if fair is None else fair)
+    stamp_ns = on_reference_clock(pairing.estimate, relation if fair is None else fair)
     return Assessment(
         pairs=pairs,
         series=series,
         ate=absolute(pairs, aligned=aligned),
         rpe=relative(pairs),
         drift=drift(pairs),
-        completeness=completeness(reference, stamp_ns, fair_pairs, fair_series),
+        completeness=completeness(pairing.reference, stamp_ns, fair_pairs, fair_series),
         nees=nees(pairs),
     )

@@ -11,8 +11,9 @@ import numpy as np
 from tsgt.analysis.compare.assessment import Assessment, assess, paired
 from tsgt.analysis.compare.checks import input_findings, quaternion_finding, relative_offset_s
 from tsgt.analysis.compare.errors import JudgedErrors, absolute
-from tsgt.analysis.compare.fitting import FitSettings, fit, nested_fits
-from tsgt.analysis.compare.relation import initial_relation
+from tsgt.analysis.compare.fitting import fit, nested_fits
+from tsgt.analysis.compare.pairing import Pairing
+from tsgt.analysis.compare.relation import FitSettings, initial_relation
 from tsgt.errors import GeometryError
 
 if TYPE_CHECKING:
@@ -208,7 +209,8 @@ def compare_estimate(
     wrong = quaternion_finding(reference, estimate, nested[-1][1].relation.offset_s)
     if wrong is not None and wrong.severity == "error":
         raise GeometryError(wrong.text)
-    steps = tuple(_step(reference, estimate, own, found, max_sigma_m) for own, found in nested)
+    pairing = Pairing(reference, estimate, max_sigma_m=max_sigma_m)
+    steps = tuple(_step(pairing, own, found) for own, found in nested)
     same = [each.fit for each in steps if _set(each.settings) == _set(settings)]
     chosen = same[0] if same else fit(reference, estimate, settings, start)
     return Comparison(
@@ -216,12 +218,10 @@ def compare_estimate(
         settings=settings,
         fit=chosen,
         errors=assess(
-            reference,
-            estimate,
+            pairing,
             chosen.relation,
             aligned=_is_aligned(settings),
             fair=[each.fit.relation for each in steps if each.fair][-1],
-            max_sigma_m=max_sigma_m,
         ),
         steps=steps,
         smallest_fair=_smallest_fair(steps),
@@ -276,15 +276,8 @@ def _is_aligned(settings: FitSettings) -> bool:
     return "frame" in settings.parts and settings.align != "none"
 
 
-def _step(
-    reference: ReferencePoses,
-    estimate: Estimate,
-    settings: FitSettings,
-    found: Fit,
-    max_sigma_m: float | None,
-) -> FitStep:
-    pairs = paired(reference, estimate, found.relation, max_sigma_m=max_sigma_m)
-    return FitStep(settings, found, absolute(pairs, aligned=_is_aligned(settings)))
+def _step(pairing: Pairing, settings: FitSettings, found: Fit) -> FitStep:
+    return FitStep(settings, found, absolute(paired(pairing, found.relation), aligned=_is_aligned(settings)))
 
 
 def _smallest_fair(steps: Sequence[FitStep]) -> int:

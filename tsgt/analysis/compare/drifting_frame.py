@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.analysis.compare.interpolation import ReferenceTrajectory
+    from tsgt.analysis.compare.interpolation import ReferenceMotion, ReferenceTrajectory
     from tsgt.analysis.compare.trajectories import Estimate
     from tsgt.geometry import FloatArray
 
@@ -190,14 +190,11 @@ def drift_at(rows: Rows, unknowns: Unknowns) -> tuple[FloatArray, FloatArray, Fl
 def linearise(trajectory: ReferenceTrajectory, rows: Rows, unknowns: Unknowns) -> Linearised:
     """Residuals and their derivatives; those of rotations to first order in the residual."""
     n, k = len(rows.row), len(rows.knot)
-    correction_ns = 1e9 * (unknowns.offset_s + unknowns.skew * rows.since_first_s)
-    motion = trajectory.motion_at(rows.stamp_ns + np.rint(correction_ns).astype(np.int64))
-    rotation, position, arm_before, arm_after = drift_at(rows, unknowns)
+    motion = trajectory.motion_at(corrected_stamp_ns(rows, unknowns))
+    pose, arm_m, arm_before, arm_after = pose_residuals(motion, rows, unknowns)
     a = rows.share[:, None, None]
-    arm_m = rotate(motion.rotation, unknowns.arm_m)
     velocity = motion.velocity_mps + np.cross(motion.angular_velocity_radps, arm_m)
-    pose, by_state, by_border = np.zeros((n, 6)), np.zeros((n, 6, 12)), np.zeros((n, 6, 9))
-    pose[:, :3] = position - motion.position_m - arm_m
+    by_state, by_border = np.zeros((n, 6, 12)), np.zeros((n, 6, 9))
     eye = np.eye(3)
     by_state[:, :3, 0:3], by_state[:, :3, 3:6] = (1 - a) * eye, -(1 - a) * skew(arm_before)
     by_state[:, :3, 6:9], by_state[:, :3, 9:12] = a * eye, -a * skew(arm_after)
@@ -205,24 +202,48 @@ def linearise(trajectory: ReferenceTrajectory, rows: Rows, unknowns: Unknowns) -
     by_border[:, :3, 2] = ((1 - a[:, 0]) * arm_before + a[:, 0] * arm_after) / unknowns.scale
     by_border[:, :3, 3:6] = -motion.rotation
     if rows.rotation is not None:
-        sensor = motion.rotation @ unknowns.R_point_sensor
-        pose[:, 3:] = log_so3(rotation @ rows.rotation @ np.swapaxes(sensor, 1, 2))
         by_state[:, 3:, 3:6], by_state[:, 3:, 9:12] = (1 - a) * eye, a * eye
         by_border[:, 3:, 0] = -motion.angular_velocity_radps
         by_border[:, 3:, 6:9] = -motion.rotation
     by_border[:, :, 1] = by_border[:, :, 0] * rows.since_first_s[:, None]
-    own = unknowns.scale * rows.position_m[rows.knot]
-    step = np.diff(own, axis=0)
-    step_before, step_after = rotate(unknowns.Q[:-1], step), rotate(unknowns.Q[1:], step)
-    walk, walk_by_state = np.zeros((k - 1, 6)), np.zeros((k - 1, 6, 12))
+    walk, step_before, step_after = walk_residuals(rows, unknowns)
+    walk_by_state = np.zeros((k - 1, 6, 12))
     walk_by_border = np.zeros((k - 1, 6, 9))
-    walk[:, :3] = np.diff(unknowns.c, axis=0) - 0.5 * (step_before + step_after)
-    walk[:, 3:] = log_so3(unknowns.Q[1:] @ np.swapaxes(unknowns.Q[:-1], 1, 2))
     walk_by_state[:, :3, 0:3], walk_by_state[:, :3, 6:9] = -eye, eye
     walk_by_state[:, :3, 3:6], walk_by_state[:, :3, 9:12] = 0.5 * skew(step_before), 0.5 * skew(step_after)
     walk_by_state[:, 3:, 3:6], walk_by_state[:, 3:, 9:12] = -eye, eye
     walk_by_border[:, :3, 2] = -0.5 * (step_before + step_after) / unknowns.scale
     return Linearised(motion.known, arm_m, pose, by_state, by_border, walk, walk_by_state, walk_by_border)
+
+
+def corrected_stamp_ns(rows: Rows, unknowns: Unknowns) -> NDArray[np.int64]:
+    """Return the instants of rows on the reference's clock, (N,)."""
+    correction_ns = 1e9 * (unknowns.offset_s + unknowns.skew * rows.since_first_s)
+    return np.asarray(rows.stamp_ns + np.rint(correction_ns).astype(np.int64))
+
+
+def pose_residuals(
+    motion: ReferenceMotion, rows: Rows, unknowns: Unknowns
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return estimate minus reference, (N, 6); the lever arm in ``station1``, (N, 3), and those from both knots."""
+    rotation, position, arm_before, arm_after = drift_at(rows, unknowns)
+    arm_m = rotate(motion.rotation, unknowns.arm_m)
+    pose = np.zeros((len(rows.row), 6))
+    pose[:, :3] = position - motion.position_m - arm_m
+    if rows.rotation is not None:
+        sensor = motion.rotation @ unknowns.R_point_sensor
+        pose[:, 3:] = log_so3(rotation @ rows.rotation @ np.swapaxes(sensor, 1, 2))
+    return pose, arm_m, arm_before, arm_after
+
+
+def walk_residuals(rows: Rows, unknowns: Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the steps of drift, (K - 1, 6), and the estimate's own steps turned as at either knot, (K - 1, 3)."""
+    step = np.diff(unknowns.scale * rows.position_m[rows.knot], axis=0)
+    step_before, step_after = rotate(unknowns.Q[:-1], step), rotate(unknowns.Q[1:], step)
+    walk = np.zeros((len(step), 6))
+    walk[:, :3] = np.diff(unknowns.c, axis=0) - 0.5 * (step_before + step_after)
+    walk[:, 3:] = log_so3(unknowns.Q[1:] @ np.swapaxes(unknowns.Q[:-1], 1, 2))
+    return walk, step_before, step_after
 
 
 def robust_weight(square: FloatArray, dimensions: int, *, convex: bool) -> FloatArray:

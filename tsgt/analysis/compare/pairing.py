@@ -41,6 +41,81 @@ class PairedPoses:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Instants:
+    """The reference at the poses of an estimate, by its clock alone."""
+
+    inside: NDArray[np.bool_]  # (M,) not before or after the reference
+    row: NDArray[np.intp]  # (K,) where the reference is known
+    stamp_ns: NDArray[np.int64]  # (K,)
+    point: FloatArray  # (K, 4, 4)
+    covariance: FloatArray | None  # (K, 6, 6) of the point
+    common: FloatArray | None
+
+
+class Pairing:
+    """Pairs an estimate with the reference under any relation; what follows from the clock alone is computed once for each clock.
+
+    ``max_sigma_m``: of the sensor's position by the reference, along its least certain direction; above, the instant is left out.
+    """
+
+    def __init__(
+        self, reference: ReferencePoses, estimate: Estimate, *, max_sigma_m: float | None = None
+    ) -> None:
+        self.reference = reference
+        self.estimate = estimate
+        self._max_sigma_m = max_sigma_m
+        self._trajectory = ReferenceTrajectory(reference)
+        self._instants: dict[tuple[float, float], _Instants] = {}
+
+    def under(self, relation: Relation) -> PairedPoses:
+        """Pair each pose with the reference at its instant, both of the sensor and in ``station1``."""
+        clock = (relation.offset_s, relation.skew)
+        if clock not in self._instants:
+            self._instants[clock] = self._at(relation)
+        at, estimate = self._instants[clock], self.estimate
+        row, stamp_ns, point, covariance, common = at.row, at.stamp_ns, at.point, at.covariance, at.common
+        arm_m = rotate(point[:, :3, :3], relation.T_point_sensor[:3, 3])
+        if arm_m.any():
+            covariance, common = (
+                None if each is None else covariance_over_lever_arm(each, arm_m)
+                for each in (covariance, common)
+            )
+        n_weak = 0
+        if self._max_sigma_m is not None and covariance is not None:
+            good = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1] <= self._max_sigma_m**2
+            n_weak = len(row) - int(np.count_nonzero(good))
+            row, stamp_ns, point, covariance = row[good], stamp_ns[good], point[good], covariance[good]
+            common = None if common is None else common[good]
+        sensor = point @ relation.T_point_sensor
+        return PairedPoses(
+            row=row,
+            stamp_ns=stamp_ns,
+            estimated=_in_station1(estimate, relation, row, sensor),
+            reference=sensor,
+            reference_covariance=covariance,
+            reference_covariance_common=common,
+            estimate_covariance=_covariance_in_station1(estimate, relation, row),
+            has_orientation=estimate.orientation_xyzw is not None,
+            n_estimate=len(estimate.stamp_ns),
+            n_outside=int(np.count_nonzero(~at.inside)),
+            n_reference_gap=int(np.count_nonzero(at.inside)) - len(at.row),
+            n_reference_weak=n_weak,
+        )
+
+    def _at(self, relation: Relation) -> _Instants:
+        reference, trajectory = self.reference, self._trajectory
+        stamp_ns = on_reference_clock(self.estimate, relation)
+        inside = (stamp_ns >= trajectory.start_ns) & (stamp_ns <= trajectory.end_ns)
+        row = np.flatnonzero(inside & trajectory.covers(stamp_ns))
+        covariance, common = (
+            None if each is None else trajectory.covariance_at(each, stamp_ns[row])
+            for each in (reference.covariance, reference.covariance_common)
+        )
+        point = trajectory.motion_at(stamp_ns[row]).transform
+        return _Instants(inside, row, stamp_ns[row], point, covariance, common)
+
+
 def pair(
     reference: ReferencePoses,
     estimate: Estimate,
@@ -48,44 +123,8 @@ def pair(
     *,
     max_sigma_m: float | None = None,
 ) -> PairedPoses:
-    """Pair each pose of an estimate with the reference at its instant, both of the sensor and in ``station1``.
-
-    ``max_sigma_m``: of the sensor's position by the reference, along its least certain direction; above, the instant is left out.
-    """
-    trajectory = ReferenceTrajectory(reference)
-    stamp_ns = on_reference_clock(estimate, relation)
-    inside = (stamp_ns >= trajectory.start_ns) & (stamp_ns <= trajectory.end_ns)
-    row = np.flatnonzero(inside & trajectory.covers(stamp_ns))
-    n_gap = int(np.count_nonzero(inside)) - len(row)
-    point = trajectory.motion_at(stamp_ns[row]).transform
-    arm_m = rotate(point[:, :3, :3], relation.T_point_sensor[:3, 3])
-    covariance, common = (
-        None
-        if each is None
-        else covariance_over_lever_arm(trajectory.covariance_at(each, stamp_ns[row]), arm_m)
-        for each in (reference.covariance, reference.covariance_common)
-    )
-    n_weak = 0
-    if max_sigma_m is not None and covariance is not None:
-        good = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1] <= max_sigma_m**2
-        n_weak = len(row) - int(np.count_nonzero(good))
-        row, point, covariance = row[good], point[good], covariance[good]
-        common = None if common is None else common[good]
-    sensor = point @ relation.T_point_sensor
-    return PairedPoses(
-        row=row,
-        stamp_ns=stamp_ns[row],
-        estimated=_in_station1(estimate, relation, row, sensor),
-        reference=sensor,
-        reference_covariance=covariance,
-        reference_covariance_common=common,
-        estimate_covariance=_covariance_in_station1(estimate, relation, row),
-        has_orientation=estimate.orientation_xyzw is not None,
-        n_estimate=len(stamp_ns),
-        n_outside=int(np.count_nonzero(~inside)),
-        n_reference_gap=n_gap,
-        n_reference_weak=n_weak,
-    )
+    """Pair as :class:`Pairing`, under one relation."""
+    return Pairing(reference, estimate, max_sigma_m=max_sigma_m).under(relation)
 
 
 def on_reference_clock(estimate: Estimate, relation: Relation) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""What stands between an estimate and the reference: clock, frame, scale and the point on the robot."""
+"""What stands between an estimate and the reference: clock, frame, scale and the point on the robot; and what of it is fitted."""
 
 from __future__ import annotations
 
@@ -32,6 +32,25 @@ class Relation:
 
 
 @dataclass(frozen=True, slots=True)
+class ExtrinsicPrior:
+    """Where the sensor is by CAD or by an earlier calibration."""
+
+    T_point_sensor: FloatArray  # (4, 4)
+    sigma: FloatArray
+    """(6,) in m along, and in rad about, the axes of the reference's point; 0: known exactly."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """What is fitted, and how the frame is aligned."""
+
+    parts: frozenset[FittedPart] = frozenset({"offset", "frame"})
+    align: Alignment = "start"
+    extrinsic_prior: ExtrinsicPrior | None = None
+    max_offset_s: float = 60.0
+
+
+@dataclass(frozen=True, slots=True)
 class Fit:
     """A fitted relation.
 
@@ -47,6 +66,7 @@ class Fit:
         str, ...
     ]  # What the motion does not determine, named likewise; not fitted, left at its prior
     used: NDArray[np.bool_]  # (M,) poses of the estimate that were used: paired, and not outliers of the fit
+    ate_sigma_m: float  # of the position ATE, by the uncertainty of clock, scale and extrinsic; NaN without a fitted frame
 
 
 def initial_relation() -> Relation:

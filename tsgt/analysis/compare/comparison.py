@@ -11,6 +11,7 @@ import numpy as np
 from tsgt.analysis.compare.assessment import Assessment, assess, paired
 from tsgt.analysis.compare.checks import input_findings, quaternion_finding, relative_offset_s
 from tsgt.analysis.compare.errors import JudgedErrors, absolute
+from tsgt.analysis.compare.fit_uncertainty import WEAK_SIGMA
 from tsgt.analysis.compare.fitting import fit, nested_fits
 from tsgt.analysis.compare.pairing import Pairing
 from tsgt.analysis.compare.relation import FitSettings, initial_relation
@@ -113,6 +114,18 @@ class Comparison:
         """What the motion does not determine, of all that could be fitted."""
         return tuple(dict.fromkeys((*self.fit.unobservable, *self.fully_aligned.fit.unobservable)))
 
+    @property
+    def weakly_determined(self) -> dict[str, float]:
+        """Sigmas, in s, m and rad, of what the motion determines, but not within 1 ms, 5 mm or 0.1 degrees at two sigmas."""
+        found: dict[str, float] = {}
+        for each in (self.fit, self.fully_aligned.fit):
+            sigmas = np.sqrt(np.maximum(np.diag(each.covariance), 0.0)).tolist()
+            found = {
+                **{n: s for n, s in zip(each.names, sigmas, strict=True) if s > WEAK_SIGMA.get(n, math.inf)},
+                **found,
+            }
+        return found
+
     def keys(self) -> dict[str, Any]:
         """Return the figures for ``--json``."""
         relation = self.fit.relation
@@ -135,12 +148,15 @@ class Comparison:
             "frame_sigma_mm": (1e3 * frame[:3]).tolist(),
             "frame_sigma_deg": np.degrees(frame[3:]).tolist(),
             "unobservable": list(self.unobservable),
+            "weakly_determined": list(self.weakly_determined),
+            "ate_fit_sigma_mm": 1e3 * self.fit.ate_sigma_m,
             "outliers": int(len(self.errors.pairs.row) - np.count_nonzero(self.fit.used)),
             **self.errors.keys(),
             "aligned": {
                 "fit": sorted(self.fully_aligned.settings.parts),
                 "offset_ms": 1e3 * self.fully_aligned.fit.relation.offset_s,
                 "extrinsic": self.fully_aligned.fit.relation.T_point_sensor.tolist(),
+                "ate_fit_sigma_mm": 1e3 * self.fully_aligned.fit.ate_sigma_m,
                 **self.fully_aligned.ate.keys(),
             },
             "steps": [each.keys() for each in self.steps],

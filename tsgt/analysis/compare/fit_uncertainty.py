@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 OBSERVABLE_SIGMA = dict(zip(NAMES, [0.05, 1e-3, 0.1, *[0.05] * 3, *[math.radians(1.0)] * 3], strict=True))
 """Sigma above which the motion does not determine an unknown to any use."""
 
+WEAK_SIGMA = {
+    "offset_s": 0.5e-3,
+    **{f"extrinsic_{axis}_m": 2.5e-3 for axis in "xyz"},
+    **{f"extrinsic_{axis}_rad": math.radians(0.05) for axis in ("roll", "pitch", "yaw")},
+}
+"""Sigma above which an unknown is not determined within 1 ms, 5 mm or 0.1 degrees at two sigmas."""
+
 WEAK_AGAINST_PRIOR = 2.0  # Sigma of the motion to that of the prior, above which the prior remains
 
 CORRELATION_S = 15.0

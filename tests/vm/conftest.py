@@ -1,0 +1,90 @@
+"""The virtual machines of these tests; `make test-vm` runs them, nothing else does."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from vm import installation
+from vm.guest import Guest, State, kvm_works
+from vm.image import CACHE, ROOT, Image, image, missing_tools
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture(scope="session")
+def bare_image() -> Image:
+    """Return Debian with our kernel module, without tsgt."""
+    if missing := missing_tools():
+        pytest.skip(f"no virtual machine: {missing}")
+    return image()
+
+
+@pytest.fixture(scope="session")
+def kvm(bare_image: Image) -> bool:
+    """Whether guests run with KVM, in real time."""
+    return kvm_works(bare_image)
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the program of this source tree."""
+    return installation.build_wheel(tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="session")
+def run_folder() -> Path:
+    """Return an empty folder for the disks of guests, on a file system that has direct I/O."""
+    folder = CACHE / "run"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def ready(bare_image: Image, kvm: bool, wheel: Path, run_folder: Path) -> State:  # noqa: FBT001 (a fixture)
+    """Return a guest that has booted, with the program and both services installed, but not started.
+
+    It is kept for the next run: with the same program, that one does not boot.
+    """
+    folder = CACHE / f"ready-{_content_hash(bare_image, kvm)}"
+    if not folder.exists():
+        for old in CACHE.glob("ready-*"):
+            shutil.rmtree(old)
+        with Guest(bare_image, run_folder / "first", kvm=kvm) as guest:
+            guest.start()
+            installation.install_program(guest, wheel)
+            installation.install_services(guest)
+            installation.start_far_ends(guest)
+            saved = guest.save(run_folder / "saved")
+        saved.folder.rename(folder)
+    return State(folder)
+
+
+@pytest.fixture(scope="module")
+def guest(
+    bare_image: Image,
+    kvm: bool,  # noqa: FBT001 (a fixture)
+    ready: State,
+    run_folder: Path,
+    request: pytest.FixtureRequest,
+) -> Iterator[Guest]:
+    """Yield a guest with the program installed; each file of tests has its own."""
+    with Guest(bare_image, run_folder / request.path.stem, kvm=kvm) as guest:
+        guest.start(ready)
+        yield guest
+
+
+def _content_hash(bare_image: Image, kvm: bool) -> str:  # noqa: FBT001 (private)
+    content = hashlib.sha256(f"{bare_image.folder.name} {kvm}".encode())
+    names = ("guest.py", "installation.py", "conftest.py", "inside/far_ends.py")
+    here = [Path(__file__).parent / name for name in names]
+    program = [*(ROOT / "tsgt").rglob("*"), *(ROOT / "configs").rglob("*")]
+    for path in [*here, ROOT / "pyproject.toml", *sorted(program)]:
+        if path.is_file() and "__pycache__" not in path.parts:
+            content.update(f"{path.relative_to(ROOT)}\0".encode() + path.read_bytes())
+    return content.hexdigest()[:12]

@@ -22,7 +22,8 @@ GRID_S = 0.05
 BASELINE_NS = 180_000_000  # Differences over it: white noise of an estimate counts little, turns remain
 MAX_BASELINE_NS = 1_100_000_000  # Estimates at 1 Hz
 MIN_OVERLAP_S = 10.0  # Of both, for a correlation to mean anything
-MIN_CORRELATION = 0.3
+MIN_CORRELATION, CLEAR_CORRELATION = 0.3, 0.7
+AMBIGUOUS_SHARE = 0.6  # Of the largest log-likelihood; of the right offset, others have less than half
 TURN_RATE_SIGMA_RADPS = 0.02
 VELOCITY_SIGMA_MPS = 0.15  # A lever arm, not yet known, moves with the turn rate
 
@@ -75,8 +76,9 @@ def offset_by_correlation(
 ) -> float:
     """Return the time offset, in s, at which turn rates and speeds of estimate and reference agree best.
 
-    Within ``max_offset_s`` of ``start_s``; this itself where the motion says nothing. Norms need neither frame nor extrinsic.
-    Masked normalised correlation (D. Padfield, 2012), so that gaps count as unknown.
+    Within ``max_offset_s`` of ``start_s``; this itself where both overlap for less than 10 s. Norms need neither frame nor extrinsic.
+    Masked normalised correlation (D. Padfield, 2012), so that gaps count as unknown; the best offset is the most likely one, as a
+    correlation over a short overlap is more often high by chance. Raises ValueError: the motion agrees nowhere, or elsewhere, too.
     """
     start_ns = round(start_s * 1e9)
     if len(motion.stamp_ns) < 2:
@@ -100,13 +102,44 @@ def offset_by_correlation(
         norms.append((_norm(reference.angular_velocity_radps), columns[1]))
     correlations = [_masked_correlation(theirs, reference.known, own, own_known) for theirs, own in norms]
     # An estimate that flies away still turns as the robot does; one whose rotation is wrong still drives.
-    shift, score = max(correlations, key=lambda each: float(each[1].max()))
-    offset_s = start_s + (first_ns - own_first_ns) / 1e9 + shift * GRID_S
-    found = np.where(np.abs(offset_s - start_s) <= max_offset_s + GRID_S, score, -1.0)
-    best = int(np.argmax(found))
-    if found[best] < MIN_CORRELATION:
-        return start_s
-    return float(offset_s[best]) + GRID_S * _vertex(found[max(best - 1, 0) : best + 2])
+    shift, score, likelihood = max(correlations, key=lambda each: float(each[2].max()))
+    order = np.argsort(shift)
+    offset_s = start_s + (first_ns - own_first_ns) / 1e9 + shift[order] * GRID_S
+    score, likelihood = score[order], likelihood[order]
+    inside = np.where(np.abs(offset_s - start_s) <= max_offset_s + GRID_S, likelihood, 0.0)
+    best, anywhere = int(np.argmax(inside)), int(np.argmax(likelihood))
+    elsewhere = inside[best] < AMBIGUOUS_SHARE * likelihood[anywhere]
+    if elsewhere and score[anywhere] >= CLEAR_CORRELATION:
+        raise ValueError(
+            f"its motion agrees best with the reference's at a time offset of {offset_s[anywhere]:.1f} s (correlation "
+            f"{score[anywhere]:.2f}), more than the {max_offset_s:g} s that are searched: is it of the same drive? if so, search further "
+            "with --max-offset-s"
+        )
+    if elsewhere or score[best] < MIN_CORRELATION:
+        raise ValueError(
+            f"its motion agrees with the reference's at no time offset within {max_offset_s:g} s (correlation {score[best]:.2f}): is it "
+            "of the same drive? search further with --max-offset-s, or leave the offset out (--fit none)"
+        )
+    other = _second_peak(inside, best)
+    if other is not None:
+        raise ValueError(
+            f"its motion agrees with the reference's about as well at a time offset of {offset_s[best]:.1f} s as at "
+            f"{offset_s[other]:.1f} s (correlations {score[best]:.2f}, {score[other]:.2f}): is it of the same drive? if so, narrow the "
+            "search with --max-offset-s"
+        )
+    return float(offset_s[best]) + GRID_S * _vertex(score[max(best - 1, 0) : best + 2])
+
+
+def _second_peak(likelihood: FloatArray, best: int) -> int | None:
+    """Return another peak that is about as likely as the best; None if there is none."""
+    low = likelihood < 0.5 * likelihood[best]
+    before, after = np.flatnonzero(low[:best]), np.flatnonzero(low[best:])
+    elsewhere = np.ones(len(likelihood), dtype=np.bool_)
+    elsewhere[(before[-1] if len(before) else 0) : (best + after[0] if len(after) else len(low))] = False
+    if not elsewhere.any():
+        return None
+    other = int(np.argmax(np.where(elsewhere, likelihood, -np.inf)))
+    return other if likelihood[other] > AMBIGUOUS_SHARE * likelihood[best] else None
 
 
 def _on_grid(
@@ -124,8 +157,11 @@ def _on_grid(
 
 def _masked_correlation(
     a: FloatArray, a_known: NDArray[np.bool_], b: FloatArray, b_known: NDArray[np.bool_]
-) -> tuple[NDArray[np.intp], FloatArray]:
-    """Shifts L and Pearson's correlation of ``a[i + L]`` with ``b[i]`` over what is known of both; -1 where that is little."""
+) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Shifts L, Pearson's correlation of ``a[i + L]`` with ``b[i]``, -1 where little of both is known, and its log-likelihood.
+
+    Against none, of normal numbers that are independent a second apart.
+    """
     size = next_fast_len(len(a) + len(b))
     a = np.where(a_known, a - a[a_known].mean(), 0.0) if a_known.any() else np.zeros(len(a))
     b = np.where(b_known, b - b[b_known].mean(), 0.0) if b_known.any() else np.zeros(len(b))
@@ -145,7 +181,9 @@ def _masked_correlation(
     enough = (count * GRID_S >= max(MIN_OVERLAP_S, 0.2 * GRID_S * count.max())) & (product > least)
     correlation = np.where(enough, covariance / np.sqrt(np.where(enough, product, 1.0)), -1.0)
     shift = np.arange(size)
-    return np.where(shift < len(a), shift, shift - size), correlation
+    clipped = np.clip(correlation, 0.0, 1.0 - 1e-9)
+    likelihood = -0.5 * count * GRID_S * np.log1p(-(clipped**2))
+    return np.where(shift < len(a), shift, shift - size), correlation, likelihood
 
 
 def _vertex(values: FloatArray) -> float:

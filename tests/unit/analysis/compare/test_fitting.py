@@ -110,6 +110,34 @@ def test_seconds_of_offset_are_found(offset_s: float) -> None:
     assert abs(found.relation.offset_s - offset_s) < 0.002
 
 
+def test_offset_beyond_the_search_is_refused() -> None:
+    """It is named where the motion shows it; nothing is fitted to what agrees by chance."""
+    true = dataclasses.replace(TRUE, offset_s=-70.0)
+    settings = FitSettings(EVERYTHING, "rigid", max_offset_s=40.0)
+    with pytest.raises(ValueError, match=r"offset of -70.0 s .* more than the 40 s that are searched"):
+        fit(long_reference(), noisy(seen(np.arange(5.0, 115.0, 0.1), true), 1), settings)
+    with pytest.raises(ValueError, match=r"at no time offset within 5 s|that are searched"):
+        fit(long_reference(), noisy(seen(np.arange(40.0, 80.0, 0.1), true), 1), replaced(settings, 5.0))
+
+
+def test_offset_of_a_motion_that_repeats_itself_is_refused() -> None:
+    """Laps of 30 s: any of them may be meant; the search can be narrowed."""
+    made = long_reference()
+    phase = 2 * np.pi * np.arange(len(made.stamp_ns)) / 600
+    path = np.stack([8 * np.sin(phase), 6 * np.cos(2 * phase), 0 * phase], axis=1)
+    laps = dataclasses.replace(made, T_station1_point=transform_from(np.eye(3), path))
+    estimate = Estimate("laps", made.stamp_ns[800:1400:2], path[800:1400:2], None, None)
+    settings = FitSettings(EVERYTHING, "rigid")
+    with pytest.raises(ValueError, match="about as well at a time offset of"):
+        fit(laps, estimate, settings)
+    assert abs(fit(laps, estimate, replaced(settings, 5.0)).relation.offset_s) < 0.01
+
+
+def replaced(settings: FitSettings, max_offset_s: float) -> FitSettings:
+    """Return settings with another search."""
+    return dataclasses.replace(settings, max_offset_s=max_offset_s)
+
+
 def test_stated_sigmas_fit_the_errors() -> None:
     """Normalised errors of white noise, over a few draws: not far above 1, not far below."""
     normalised = []

@@ -12,10 +12,14 @@ FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic cl
 	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
 	superframe_messages tum))
 
-.PHONY: demo test test-all lint types layers fast-tests all-tests test-libs pi-libs test-vm ros2 docs fuzz soak bench generated format clean
+.PHONY: demo bundle test test-all lint types layers fast-tests all-tests test-libs pi-libs test-vm ros2 docs fuzz soak bench generated format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/tsgt demo --duration $(DURATION)
+
+# The offline bundle: a Debian package for each of ARCHITECTURES, arm64 for a Raspberry Pi and amd64 for a PC, into dist/.
+bundle: $(VENV)/.runtime
+	$(BIN)/python packaging/bundle.py --output dist $(ARCHITECTURES)
 
 # Lint, types, layers and the fast tests: a few minutes, what to run before a commit.
 test: lint types layers fast-tests

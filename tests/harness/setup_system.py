@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from harness.fake_machine import ADAPTER, FakeMachine
 from harness.radios import running_timeline
 
-from tsgt.config import ScenarioConfig
+from tsgt.config import ScenarioConfig, TcpAddress
 from tsgt.setup import Ran, System
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import VirtualClock
@@ -19,10 +20,9 @@ from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from tsgt.doctor import Machine
-    from tsgt.radio.sx127x import Hal, Wiring
+    from tsgt.radio.sx127x import EdgeCallback, Hal, Wiring
     from tsgt.station.serial import OpenPort
 
 OS_RELEASE = 'PRETTY_NAME="Raspberry Pi OS (bookworm)"\nID=debian\nVERSION_ID="12"\n'
@@ -40,6 +40,13 @@ class Unconnected:
 
     def set_reset(self, *, low: bool) -> None:
         """Drive a pin that is connected to nothing."""
+
+    def dio0(self) -> bool:
+        """Read a pin that is pulled down."""
+        return False
+
+    def on_dio0(self, callback: EdgeCallback) -> None:
+        """Wait for edges that never come."""
 
     def close(self) -> None:
         """Release it."""
@@ -131,15 +138,16 @@ class PiToSetUp:
 
     def _open_hal(self, wiring: Wiring) -> Hal:
         if self.nss_pin is None or wiring.nss_pin != (None if self.nss_pin < 0 else self.nss_pin):
-            return Unconnected()  # type: ignore[return-value] (nobody waits for edges of a chip that is not there)
+            return Unconnected()
         timeline = running_timeline()
         air = Air(timeline, np.random.default_rng(0), LinkModel())
         return SimulatedHal(
             SX1276Chip(timeline, lambda antenna: air.join(antenna, "here"), np.random.default_rng(1))
         )
 
-    def _open_port(self, path: Path) -> OpenPort:
-        set_to = self.instruments[path.name]
+    def _open_port(self, path: Path | TcpAddress) -> OpenPort:
+        name = path.name if isinstance(path, Path) else str(path)
+        set_to = self.instruments[name]
         scenario = ScenarioConfig()
         timeline, rng = running_timeline(), np.random.default_rng(1)
         station = SimulatedTotalStation(
@@ -149,7 +157,7 @@ class PiToSetUp:
             station.switch_off()
         else:
             station.baud = set_to
-        return SimulatedLine(station, timeline, VirtualClock(0), name=path.name).open
+        return SimulatedLine(station, timeline, VirtualClock(0), name=name).open
 
     def _run(self, arguments: Sequence[str]) -> Ran:
         match list(arguments):

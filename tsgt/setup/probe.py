@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from tsgt.config import WiringConfig
@@ -12,9 +13,9 @@ from tsgt.radio.sx127x import Chip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
 
     from tsgt.clock import Clock
+    from tsgt.config import TcpAddress
     from tsgt.radio import LoRaSettings
     from tsgt.radio.sx127x import Hal, Wiring
     from tsgt.station.serial import OpenPort
@@ -28,21 +29,22 @@ KERNEL_NSS: Final = -1
 class FoundInstrument:
     """An instrument that responds at a serial port."""
 
-    port: Path
-    baud: int
+    port: Path | TcpAddress
+    baud: int | None
     model: str
     serial_number: str
 
     def __str__(self) -> str:
         number = f", number {self.serial_number}" if self.serial_number else ""
-        return f"{self.model or 'an instrument without a name'}{number}, at {self.baud} baud"
+        rate = f", at {self.baud} baud" if self.baud is not None else ""
+        return f"{self.model or 'an instrument without a name'}{number}{rate}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SerialPorts:
-    """Access to serial ports: how to open one, and the process that has one open, or None."""
+class Ports:
+    """Access to ports: how to open one, and the process that has a serial one open, or None."""
 
-    open_port: Callable[[Path], OpenPort]
+    open_port: Callable[[Path | TcpAddress], OpenPort]
     holder: Callable[[Path], str | None]
 
 
@@ -115,8 +117,8 @@ def _wiring_text(candidate: WiringConfig) -> str:
 
 
 async def find_instruments(
-    ports: list[Path], access: SerialPorts, clock: Clock, *, baud: int = DEFAULT_BAUD
-) -> tuple[list[FoundInstrument], dict[Path, str]]:
+    ports: Sequence[Path | TcpAddress], access: Ports, clock: Clock, *, baud: int = DEFAULT_BAUD
+) -> tuple[list[FoundInstrument], dict[Path | TcpAddress, str]]:
     """Ask for an instrument at each port, at all common baud rates, which takes ten seconds for a silent port.
 
     Returns the instruments, and for every other port why there is none.
@@ -125,9 +127,10 @@ async def find_instruments(
     from tsgt.station.geocom import connect  # noqa: PLC0415
     from tsgt.station.leica import identify  # noqa: PLC0415
 
-    found, silent = [], {}
+    found: list[FoundInstrument] = []
+    silent: dict[Path | TcpAddress, str] = {}
     for port in ports:
-        if (holder := access.holder(port)) is not None:
+        if isinstance(port, Path) and (holder := access.holder(port)) is not None:
             silent[port] = f"it is open in {holder}"
             continue
         try:

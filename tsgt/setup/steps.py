@@ -69,7 +69,7 @@ def system_step(system: System, role: Role, *, dry_run: bool = False) -> Step:
         return _problem("system", f"Python {python} is too old, {'.'.join(map(str, MIN_PYTHON))} is needed")
     if system.uid != 0 and system.live and not dry_run:
         return _problem("system", f"the setup changes the system: sudo tsgt setup {role.word}")
-    return Step(name="system", detail=f"{name}, Python {python}")
+    return Step(name="system", detail=f"{name}, Python {python}" if system.live else f"image of {name}")
 
 
 def spi_devices(system: System) -> list[str]:
@@ -84,6 +84,10 @@ def spi_step(system: System) -> Step:
     if name is None:
         if devices:
             return Step(name="spi", detail=f"/dev/{devices[0]} exists")
+        if not system.live:
+            return Step(
+                name="spi", detail=f"this image has no {_BOOT_CONFIGS[0]}: enable SPI on the machine itself"
+            )
         return _problem(
             "spi",
             f"there is no /dev/spidev* and no {_BOOT_CONFIGS[0]}: this is no Raspberry Pi; enable SPI as its maker says",
@@ -184,9 +188,13 @@ def configuration_step(system: System, role: Role, new: str, *, replace: bool) -
     return Step(name="configuration", detail=role.config, changes=tuple(changes))
 
 
-def services_step(system: System, role: Role) -> Step:
-    """Install unit and udev rules, and let the service start at boot."""
-    unit = _installed(system, "systemd", role.unit)
+def services_step(system: System, role: Role, *, network: bool = False) -> Step:
+    """Install unit and udev rules, and let the service start at boot; ``network``: its instrument is in the network."""
+    unit = [*_installed(system, "systemd", role.unit)]
+    if network:
+        text = _content("systemd", "network-instrument.conf")
+        name = f"/etc/systemd/system/{role.unit}.d/network-instrument.conf"
+        unit += [] if system.read(name) == text else [WriteFile(name=name, text=text)]
     rules = _installed(system, "udev", "60-tsgt.rules")
     changes: list[Change] = [*unit, *rules]
     if unit:
@@ -247,12 +255,16 @@ def start_step(system: System, role: Role, *, changed: bool) -> Step:
 
 def _installed(system: System, kind: str, name: str) -> Sequence[Change]:
     """Return the change that installs a file of ours; nothing if it is in force already."""
-    text = (files("tsgt.setup") / "files" / kind / name).read_text(encoding="utf-8")
+    text = _content(kind, name)
     folders = _FOLDERS[kind]
     found = next(
         (there for folder in folders if (there := system.read(f"{folder}/{name}")) is not None), None
     )
     return [] if found == text else [WriteFile(name=f"{folders[0]}/{name}", text=text)]
+
+
+def _content(kind: str, name: str) -> str:
+    return (files("tsgt.setup") / "files" / kind / name).read_text(encoding="utf-8")
 
 
 def _problem(name: str, detail: str) -> Step:

@@ -23,6 +23,7 @@ from tsgt.radio.planning import DIPOLE_DBI, MIN_POWER_DBM
 from tsgt.setup import (
     USER,
     State,
+    WiringSearch,
     clock_step,
     compare_configuration,
     configuration_step,
@@ -118,18 +119,24 @@ def _wiring(
 ) -> WiringConfig:
     """Return the wiring with which the radio responds; in an image the given one."""
     system, search = session.system, common.search
+    asked = search != WiringSearch()
     if not system.live:
-        wiring = next(search.wirings(["spidev0.0"]))
+        wiring = before if before is not None and not asked else next(search.wirings(["spidev0.0"]))
         session.report("radio", ok=True, detail=f"not asked in an image; {_shown(wiring)}")
         return wiring
     if before is not None and is_running(session):
+        if asked:
+            session.fail("radio", f"in use by the running service: sudo systemctl stop {session.role.unit}")
         session.report("radio", ok=True, detail=f"in use by the running service; {_shown(before)}")
         return before
     if session.dry_run and not spi_devices(system):
         wiring = next(search.wirings(["spidev0.0"]))
         session.report("radio", ok=True, detail="would be asked when SPI is enabled")
         return wiring
-    candidates = [*([] if before is None else [before]), *search.wirings(spi_devices(system))]
+    candidates = [
+        *([before] if before is not None and not asked else []),
+        *search.wirings(spi_devices(system)),
+    ]
     machine = doctor.this_machine()
     try:
         found = service.run(
@@ -153,17 +160,24 @@ def _shown(wiring: WiringConfig) -> str:
 
 
 def configure(
-    session: Session, common: Common, text: str | None, *, key: bytes | None, expected: Collection[str]
+    session: Session,
+    common: Common,
+    text: str | None,
+    *,
+    key: bytes | None,
+    expected: Collection[str],
+    network: bool = False,
 ) -> None:
     """Install key, configuration and service, check the machine, and start the service.
 
     ``text``: of the configuration; None keeps the one that is there. ``expected``: checks that fail until the machine is
     complete, because an instrument or a calibration is still missing.
+    ``network``: whether the instrument is in the network, which the service may use then.
     """
     system, role = session.system, session.role
     changed = session.do(key_step(system, key, replace=common.replace_key))
     changed |= _place_configuration(session, common, text)
-    changed |= session.do(services_step(system, role))
+    changed |= session.do(services_step(system, role, network=network))
     session.do(journal_step(system))
     session.do(clock_step(system, role))
     if session.dry_run:

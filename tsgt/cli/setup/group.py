@@ -121,7 +121,7 @@ def _common(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option(
     "--instrument",
     metavar="PORT|none",
-    help="Serial port of the instrument; none: not there yet.  [default: found]",
+    help="Serial port of the instrument, or tcp://HOST:PORT; none: not there yet.  [default: found]",
 )
 @click.option("--prism-type", type=click.Choice(PRISM_TYPES), help="Reflector on the robot.")
 @_common

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from pydantic import TypeAdapter, ValidationError
 
 from tsgt import service
 from tsgt.cli import doctor
@@ -19,13 +20,13 @@ from tsgt.cli.setup.common import (
 from tsgt.cli.setup.mission import given_mission, mission_key, mission_of
 from tsgt.cli.setup.options import answer
 from tsgt.cli.setup.session import SetupStopped
-from tsgt.config import ClientConfig
+from tsgt.config import ClientConfig, InstrumentPort, TcpAddress
 from tsgt.errors import ConfigError
 from tsgt.setup import (
     CLIENT,
     NO_INSTRUMENT,
     MissionError,
-    SerialPorts,
+    Ports,
     StationAnswers,
     client_text,
     find_instruments,
@@ -101,7 +102,14 @@ def run_station_setup(
             radio=radio,
         )
         expected = _WITHOUT_INSTRUMENT if port == NO_INSTRUMENT else ()
-        configure(session, common, client_text(answers), key=shared.key, expected=expected)
+        configure(
+            session,
+            common,
+            client_text(answers),
+            key=shared.key,
+            expected=expected,
+            network=port.startswith("tcp://"),
+        )
     except SetupStopped:
         pass
     return session.finish()
@@ -143,8 +151,8 @@ def _instrument(session: Session, given: str | None, before: StationAnswers | No
         session.report("instrument", ok=True, detail=f"{given}, not asked in an image")
         return given, DEFAULT_BAUD
     machine = doctor.this_machine()
-    ports = [Path(given)] if given is not None else sorted((machine.dev / "serial" / "by-id").glob("*"))
-    access = SerialPorts(open_port=machine.open_port, holder=machine.port_holder)
+    ports = [_port(given)] if given is not None else sorted((machine.dev / "serial" / "by-id").glob("*"))
+    access = Ports(open_port=machine.open_port, holder=machine.port_holder)
     if ports:
         session.say(f"{'':8}asking for an instrument at {', '.join(map(str, ports))} ...")
     found, silent = service.run(lambda: find_instruments(ports, access, machine.clock))
@@ -156,7 +164,7 @@ def _instrument(session: Session, given: str | None, before: StationAnswers | No
 def _chosen(
     session: Session,
     found: list[FoundInstrument],
-    silent: dict[Path, str],
+    silent: dict[Path | TcpAddress, str],
     given: str | None,
     before: StationAnswers | None,
 ) -> tuple[str, int]:
@@ -179,4 +187,12 @@ def _chosen(
             session.say(f"  {number}  {each.port}: {each}")
         chosen = found[click.prompt("Which one", type=click.IntRange(1, len(found)), default=1) - 1]
     session.report("instrument", ok=True, detail=f"{chosen}, {chosen.port}")
-    return str(chosen.port), chosen.baud
+    return str(chosen.port), DEFAULT_BAUD if chosen.baud is None else chosen.baud
+
+
+def _port(given: str) -> Path | TcpAddress:
+    """Return the port that an option names; a usage error for an impossible one."""
+    try:
+        return TypeAdapter[Path | TcpAddress](InstrumentPort).validate_python(given)
+    except ValidationError as error:
+        raise click.UsageError(f"--instrument {given}: {error.errors()[0]['msg']}") from error

@@ -157,6 +157,16 @@ def test_two_instruments_need_a_choice(tsgt: Tsgt, pi: PiToSetUp) -> None:
     assert tsgt(*STATION, "--instrument", other).code == 0
 
 
+def test_instrument_in_the_network_is_let_through(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """The sandbox of the service denies the network otherwise."""
+    pi.instruments["tcp://10.0.0.5:1212"] = 115_200
+    assert tsgt(*STATION, "--instrument", "tcp://10.0.0.5:1212").code == 0
+    instrument = client(pi).instrument
+    assert isinstance(instrument, LeicaInstrumentConfig)
+    assert str(instrument.port) == "tcp://10.0.0.5:1212"
+    assert (pi.root / "etc/systemd/system/tsgt-client.service.d/network-instrument.conf").exists()
+
+
 def test_radio_that_does_not_respond_stops_the_setup(tsgt: Tsgt, pi: PiToSetUp) -> None:
     """The message says where it was looked for; no configuration is written."""
     pi.nss_pin = None

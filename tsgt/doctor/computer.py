@@ -66,7 +66,7 @@ def check_user(machine: Machine, service: Mapping[str, str] | None) -> Finding:
         return failed(
             "user",
             f"the service runs as {service['User']} with the groups {groups}, and one of these does not exist on this "
-            "machine: docs/how-to/install-for-the-field.md, step 1",
+            "machine: sudo tsgt setup station, or master, makes them",
         )
     if user is None or user == machine.user:
         return ok("user", f"permissions are checked for the user {machine.user.name}, who runs this")
@@ -82,7 +82,7 @@ def check_service(kind: Kind, config: Path, service: Mapping[str, str] | None) -
         return note(
             "service",
             f"there is no unit {unit}.service: after a power cut {unit} must be started by hand; "
-            "docs/how-to/install-for-the-field.md, step 4",
+            f"sudo tsgt setup {'station' if kind == 'client' else 'master'} installs it",
         )
     if service.get("UnitFileState") != "enabled":
         return failed("service", f"{unit} does not start at boot: sudo systemctl enable {unit}")

@@ -14,10 +14,7 @@ if TYPE_CHECKING:
 
 SLOW_TIMER_MS = 2  # A longer latency timer takes too much of the 50 ms of a measurement at 20 Hz
 RULES = "udev/rules.d/60-tsgt.rules"
-INSTALL_RULES = (
-    f"sudo install -m 644 configs/udev/60-tsgt.rules /etc/{RULES}, then "
-    "sudo udevadm control --reload && sudo udevadm trigger"
-)
+INSTALL_RULES = "sudo tsgt setup station, or master, installs the udev rules"
 
 
 def check_serial_port(machine: Machine, port: Path, user: User) -> Finding:
@@ -58,7 +55,9 @@ def check_serial_port_free(machine: Machine, port: Path, *, daemon: bool) -> Fin
             "serial_port_free",
             f"{port} is open in {holder}, and two programs corrupt each other's data: end it",
         )
-    if _service_active(machine, "ModemManager") and not (machine.etc / RULES).exists():
+    if _service_active(machine, "ModemManager") and not any(
+        (folder / RULES).exists() for folder in (machine.etc, machine.etc.parent / "usr/lib")
+    ):
         return note(
             "serial_port_free",
             f"free, but ModemManager is running and opens each line that is plugged in: {INSTALL_RULES}",

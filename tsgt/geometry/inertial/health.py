@@ -174,7 +174,7 @@ class HealthMonitor:
         long = (rows - begin >= repeated) & (np.abs(values) > MIN_LIMITS) & others_move
         for axis in np.flatnonzero(long.any(axis=0)):
             found[:, axis] = np.isin(begin[:, axis], begin[long[:, axis], axis])
-        for axis in np.flatnonzero(moves):
+        for axis in np.flatnonzero(moves & _repeats(values[~stuck[:, 0]])):
             changing = values[~stuck[:, 0], axis]
             ordered = np.sort(changing)
             ends = np.flatnonzero(np.diff(ordered, append=np.inf) > _ROUNDING * np.abs(ordered))
@@ -208,3 +208,11 @@ class HealthMonitor:
     def _report(self, problem: str, time_s: float) -> None:
         self._now_s = max(self._now_s, time_s)
         self._problem, self._problem_s = problem, max(self._problem_s, time_s)
+
+
+def _repeats(values: FloatArray) -> NDArray[np.bool_]:
+    """Whether a value occurs three times or more, for each column of (M, C): fewer never show a limit."""
+    ordered = np.sort(values, axis=0)
+    same = ~(np.diff(ordered, axis=0) > _ROUNDING * np.abs(ordered[:-1]))
+    found: NDArray[np.bool_] = np.logical_or.reduce(same[:-1] & same[1:], axis=0)
+    return found

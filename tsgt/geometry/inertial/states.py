@@ -9,6 +9,7 @@ slip, and the direction of travel.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -182,13 +183,19 @@ class Gravity:
 
     def vector(self) -> FloatArray:
         """(3,) acceleration of a falling body in frame ``station1``, m/s^2."""
-        return self._with_jacobian()[0]
+        return _falling(self.magnitude_mps2, self.tilt.tobytes())[0]
 
     def by_tilt(self) -> FloatArray:
         """(3, 2) Jacobian of that vector by the tilt."""
-        return self._with_jacobian()[1]
+        return _falling(self.magnitude_mps2, self.tilt.tobytes())[1]
 
-    def _with_jacobian(self) -> tuple[FloatArray, FloatArray]:
-        rotation, J_r = exp_and_right_jacobian(np.append(self.tilt, 0.0))
-        down = np.array([0.0, 0.0, -self.magnitude_mps2])
-        return rotation @ down, -(rotation @ skew(down) @ J_r)[:, :TILT_DIM]
+
+@lru_cache(maxsize=16)
+def _falling(magnitude_mps2: float, tilt: bytes) -> tuple[FloatArray, FloatArray]:
+    """(3,) acceleration of a falling body, and its (3, 2) Jacobian by the tilt; each step of a solver asks several times."""
+    rotation, J_r = exp_and_right_jacobian(np.append(np.frombuffer(tilt), 0.0))
+    down = np.array([0.0, 0.0, -magnitude_mps2])
+    found = rotation @ down, -(rotation @ skew(down) @ J_r)[:, :TILT_DIM]
+    for each in found:
+        each.flags.writeable = False
+    return found

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation import build_tracks, centroid_at_point, transform_of, usable
+from tsgt.estimation import build_tracks, centroid_at_point, centroid_m, transform_of, usable
 from tsgt.geometry import invert, log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MIN_PRISMS
-from tsgt.simulation.faults import KNOCK_ROTATION_RAD
+from tsgt.simulation.faults import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,29 +70,33 @@ def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]
     poses = poses.select(poses.series != "interpolated")
     errors, nees = _errors(poses, master_log, result)
     error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
-    limits = np.full(error_norms.shape, _STATE_TOLERANCE)
-    limits[:, 1] += untold_rotation_rad(poses, master_log, result)
+    limits = _STATE_TOLERANCE + untold_displacements(poses, master_log, result)
     for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms > limits).any(axis=1)).tolist():
         yield (
             f"{poses.series[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "
-            f"{error_norms[index, 1]:.4f} rad, limits {limits[index, 0]:g} and {limits[index, 1]:.3g}; "
+            f"{error_norms[index, 1]:.4f} rad, limits {limits[index, 0]:.3g} and {limits[index, 1]:.3g}; "
             f"NEES {nees[index]:.0f}, limit {_MAX_NEES:g}"
         )
 
 
-def untold_rotation_rad(
+def untold_displacements(
     poses: ValidPoses, master_log: MasterLog, result: MissionResult
 ) -> NDArray[np.float64]:
-    """Rotation by which the IMU has been knocked before each pose, and of which prisms tell nothing, (N,).
+    """By what the IMU has been knocked before each pose that prisms do not tell: in m at their centroid and in rad, (N, 2).
 
     A single prism tells no rotation of the IMU on the robot, and two none about their line: the poses are turned by it
-    (docs/how-to/one-or-two-stations.md). A master that was started after the knock, or had no samples of it, cannot know.
+    (docs/how-to/one-or-two-stations.md). A displacement is named from 50 mm on. A master that was started after the knock, or had
+    no samples of it, cannot know.
     """
-    if len(result.parameters.prisms) >= MIN_PRISMS:
-        return np.zeros(len(poses.stamp_ns))
+    parameters = result.parameters
+    if parameters.imu is None or len(parameters.prisms) >= MIN_PRISMS:
+        return np.zeros((len(poses.stamp_ns), 2))
     at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
-    knocks = np.searchsorted(np.sort(result.knocks_s), at_s)
-    return np.multiply(KNOCK_ROTATION_RAD, knocks, dtype=np.float64)
+    lever_m = float(np.linalg.norm(np.array(parameters.imu.position_m) - centroid_m(parameters)))
+    each = np.array([KNOCK_DISPLACEMENT_M + lever_m * KNOCK_ROTATION_RAD, KNOCK_ROTATION_RAD])
+    knocks = np.searchsorted(np.sort(result.knocks_s), at_s).astype(np.float64)
+    displaced: NDArray[np.float64] = knocks[:, None] * each
+    return displaced
 
 
 def distribution_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
@@ -105,7 +109,7 @@ def distribution_failures(master_log: MasterLog, result: MissionResult) -> Itera
     if any(station_log.folder is None for station_log in result.station_logs.values()):
         return
     every = master_log.valid_poses()
-    every = every.select(untold_rotation_rad(every, master_log, result) == 0.0)
+    every = every.select(untold_displacements(every, master_log, result)[:, 1] == 0.0)
     for series in np.unique(every.series).tolist():
         poses = every.select(every.series == series)
         if len(poses.stamp_ns) < _MIN_POSES:

@@ -15,7 +15,7 @@ from tsgt.simulation.faults.catalogue import (
     draw_faults,
     parse_faults,
 )
-from tsgt.simulation.faults.imu_conditions import KNOCK_ROTATION_RAD, imu_conditions
+from tsgt.simulation.faults.imu_conditions import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD, imu_conditions
 from tsgt.simulation.faults.injection import inject_fault, relock_instruments
 from tsgt.simulation.faults.odometry_conditions import odometry_conditions
 
@@ -24,6 +24,7 @@ __all__ = [
     "FAULT_FREE_START_S",
     "FAULT_FREE_TAIL_S",
     "IMU_FAULTS",
+    "KNOCK_DISPLACEMENT_M",
     "KNOCK_ROTATION_RAD",
     "ODOMETRY_FAULTS",
     "Fault",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tsgt.config import ScenarioConfig, SimulatedImu, scenario_parameters
-from tsgt.simulation.checks.pose_consistency import max_median_rotation_rad, untold_rotation_rad
+from tsgt.simulation.checks.pose_consistency import max_median_rotation_rad, untold_displacements
 
 
 @pytest.mark.parametrize(
@@ -27,9 +27,14 @@ def test_limit_of_the_median_rotation(prisms: int, model: str, limit_rad: float)
 
 @pytest.mark.parametrize(("prisms", "knocks"), [(3, [0, 0, 0]), (2, [0, 1, 2]), (1, [0, 1, 2])])
 def test_few_prisms_do_not_tell_how_the_imu_was_knocked(prisms: int, knocks: list[int]) -> None:
-    """By a degree at 60 s and at 110 s; three prisms tell it."""
-    result: Any = SimpleNamespace(parameters=SimpleNamespace(prisms=(None,) * prisms), knocks_s=(110.0, 60.0))
+    """By a degree and 20 mm at 60 s and at 110 s; three prisms tell it."""
+    parameters = scenario_parameters(ScenarioConfig(imu=SimulatedImu(model="industrial")), imu=True)
+    parameters = replace(parameters, prisms=parameters.prisms[:prisms])
+    result: Any = SimpleNamespace(parameters=parameters, knocks_s=(110.0, 60.0))
     poses: Any = SimpleNamespace(stamp_ns=np.array([50, 100, 150]) * 1_000_000_000)
     master_log: Any = SimpleNamespace(unix_at_zero_ns=0)
-    untold_rad = untold_rotation_rad(poses, master_log, result)
-    assert untold_rad == pytest.approx(np.radians(knocks))
+    untold = untold_displacements(poses, master_log, result)
+    assert untold[:, 1] == pytest.approx(np.radians(knocks))
+    # The prisms are between a quarter of a metre and two metres from the IMU.
+    assert (untold[:, 0] >= 0.02 * np.array(knocks) + 0.25 * untold[:, 1]).all()
+    assert (untold[:, 0] <= 0.02 * np.array(knocks) + 2.0 * untold[:, 1]).all()

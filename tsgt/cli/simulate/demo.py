@@ -22,7 +22,7 @@ from tsgt.cli.output import print_json, require_new_file
 from tsgt.cli.simulate.command import protocol_option
 from tsgt.cli.simulate.demo_progress import Progress
 from tsgt.clock import SystemClock, UnixTimeline
-from tsgt.config import ScenarioConfig, check_permissions, load
+from tsgt.config import ScenarioConfig, SimulatedImu, check_permissions, load
 from tsgt.errors import OutputFileError, StreamError
 from tsgt.estimation import point_label
 from tsgt.log import configure_logging
@@ -32,6 +32,7 @@ from tsgt.simulation.options import SimulationOptions
 
 if TYPE_CHECKING:
     from tsgt.analysis.evaluation import LivePoses
+    from tsgt.config import ImuModelName
     from tsgt.model import ReferencePoint
     from tsgt.simulation.demo import DemoFiles
 
@@ -63,6 +64,13 @@ class Result:
 @click.option("--socket", "socket_path", type=path_type, help="UNIX socket of the pose stream.")
 @click.option("--output", type=OutputFile(*RECORDING_SUFFIXES), help="Recording to write (.jsonl).")
 @model_option(SimulationOptions, "seed")
+@model_option(
+    SimulatedImu,
+    "model",
+    "--imu",
+    default=None,
+    help="Class of the robot's IMU, with which live poses rest on it.  [default: that of the scenario]",
+)
 @click.option("--scenario", "scenario_path", type=path_type, help="Scenario (TOML).  [default: dynamic]")
 @json_option
 def demo(
@@ -73,6 +81,7 @@ def demo(
     output: Path | None,
     seed: int,
     scenario_path: Path | None,
+    model: ImuModelName | None,
     as_json: bool,
 ) -> None:
     """Run simulated stations and a master in real time.
@@ -83,6 +92,8 @@ def demo(
     Ctrl-C ends the demonstration early, with the summary so far.
     """
     scenario = ScenarioConfig() if scenario_path is None else load(scenario_path, ScenarioConfig)
+    if model is not None:
+        scenario = scenario.model_copy(update={"imu": scenario.imu.model_copy(update={"model": model})})
     if duration_s is None:
         duration_s = DEFAULT_DURATION_S if scenario_path is None else scenario.duration_s
     require_new_file(output)

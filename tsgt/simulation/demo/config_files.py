@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 from tsgt.config import scenario_parameters
 from tsgt.radio.key_file import write_key
+from tsgt.simulation.demo.imu import imu_command
 from tsgt.simulation.mission import instrument_config
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.config import ScenarioConfig, SimulatedStation
+    from tsgt.model import ImuParameters
 
 Protocol = Literal["superframe", "classic"]
 
@@ -59,6 +61,27 @@ class DemoFiles:
     def recordings(self) -> Path:
         """Folder of the master's recordings."""
         return self.folder / "recordings"
+
+    @property
+    def imu_socket(self) -> Path:
+        """UNIX socket with the lines of the robot's IMU."""
+        return self.folder / "imu.sock"
+
+    def add_imu(self, imu: ImuParameters, noise: str) -> None:
+        """Add an IMU, with the preset of its noise, to the configuration of the master."""
+        with self.master_config.open("a") as file:
+            file.write(
+                f"""
+[imu]
+command = {json.dumps(imu_command(self.imu_socket.absolute()))}
+position_m = {json.dumps(imu.position_m)}
+orientation_xyzw = {json.dumps(imu.orientation_xyzw)}
+latency_ms = {imu.latency_ns / 1e6!r}
+gyro_matrix = {json.dumps(imu.gyro_matrix)}
+gravity_mps2 = {imu.gravity_mps2!r}
+noise = {{ preset = {json.dumps(noise)} }}
+"""
+            )
 
     def client_config(self, station: int) -> Path:
         """Return the configuration of a station's client."""

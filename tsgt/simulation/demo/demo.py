@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack, suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.config import scenario_parameters
 from tsgt.errors import StreamError
+from tsgt.simulation.demo.imu import ImuServer
 from tsgt.simulation.demo.processes import Process
+from tsgt.simulation.imu import IMU_MODELS, ImuProgram, simulate_imu
 from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
 from tsgt.simulation.kernel import LoopTimeline
 from tsgt.simulation.lora import AirServer, scenario_link
-from tsgt.simulation.world import scenario_world
+from tsgt.simulation.world import is_shaken, scenario_world
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,11 +29,13 @@ if TYPE_CHECKING:
     from tsgt.clock import Clock
     from tsgt.config import ScenarioConfig
     from tsgt.simulation.demo.config_files import DemoFiles
+    from tsgt.simulation.imu import DeviceSamples
     from tsgt.simulation.lora import LinkModel
 
 STARTUP_TIMEOUT_S = 60.0
 """From the start of the daemons to the first pose; a slow machine takes five seconds."""
 
+_SHAKING_SEED = 0x5A
 _MAX_LINE_BYTES = 1 << 20
 _RECONNECT_DELAY_S = 0.2
 _FINAL_READ_TIMEOUT_S = 2.0
@@ -70,6 +75,7 @@ class Demo:
         )
         self.world = scenario_world(scenario, duration_s + STARTUP_TIMEOUT_S + 10, world_rng)
         self.parameters = scenario_parameters(scenario)
+        self._imu = None if scenario.imu.model == "none" else self._simulated_imu(duration_s, seed)
         self.start_ns = clock.monotonic_ns()  # CLOCK_MONOTONIC at the start of the world, in ns
         self.processes = [
             Process(
@@ -108,6 +114,11 @@ class Demo:
                 )
                 port = self._files.instrument_port(station.station)
                 await stack.enter_async_context(PtyLine(instrument, port))
+            if self._imu is not None:
+                # The samples on CLOCK_MONOTONIC.
+                samples = replace(self._imu, arrival_s=self._imu.arrival_s + self.start_ns / 1e9)
+                program = ImuProgram(IMU_MODELS[self._scenario.imu.model], samples, self._clock)
+                await stack.enter_async_context(ImuServer(self._files.imu_socket, program, self._clock))
             tasks = [asyncio.create_task(process.keep_running()) for process in self.processes]
             reading = asyncio.create_task(self._read(on_line))
             try:
@@ -120,6 +131,17 @@ class Demo:
                 await asyncio.wait([reading], timeout=_FINAL_READ_TIMEOUT_S)
                 reading.cancel()
                 await asyncio.wait([reading])
+
+    def _simulated_imu(self, duration_s: float, seed: int) -> DeviceSamples:
+        """Shake the robot, simulate its IMU, and add that to the configuration of the master."""
+        scenario = self._scenario
+        if is_shaken(scenario):
+            shaking_rng = np.random.default_rng([seed, _SHAKING_SEED])
+            self.world.shake(scenario.shaking, np.array(scenario.imu.position_m), shaking_rng)
+        run = simulate_imu(scenario.imu, self.world.motion_at, duration_s + STARTUP_TIMEOUT_S, seed=[seed])
+        self.parameters = replace(self.parameters, imu=run.parameters)
+        self._files.add_imu(run.parameters, scenario.imu.model)
+        return run.samples
 
     def _link(self) -> LinkModel:
         """Return the scenario's link model; the robot's radio stays at the centre of its area."""

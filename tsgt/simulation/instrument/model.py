@@ -125,6 +125,11 @@ class TotalStationModel:
         self.reported_distances: list[ReportedDistance] = []  # each reported distance once
         self.beeps: list[int] = []  # True times of beeps in ns
 
+    @property
+    def timeline(self) -> Timeline:
+        """Time of whatever is connected to it, too."""
+        return self._timeline
+
     def now_ns(self) -> int:
         """Return the true time in ns."""
         return self._timeline.now_ns()

@@ -14,7 +14,6 @@ import tty
 from typing import TYPE_CHECKING, Self
 
 from tsgt.simulation.instrument.serial_line import Wire
-from tsgt.simulation.kernel import LoopTimeline
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -48,7 +47,7 @@ class PtyLine:
 
     async def __aenter__(self) -> Self:
         """Plug in."""
-        self._wire = Wire(self._instrument, LoopTimeline(asyncio.get_running_loop()), self._deliver)
+        self._wire = Wire(self._instrument, self._instrument.timeline, self._deliver)
         self.plug()
         return self
 

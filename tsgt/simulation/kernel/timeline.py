@@ -119,16 +119,29 @@ class _Event:
 class LoopTimeline:
     """CLOCK_MONOTONIC on an asyncio loop in real time, for simulated hardware in real processes.
 
-    Callbacks may be up to a millisecond late, as loop timers are; an event that needs an exact time must carry it.
+    Callbacks may be late: a millisecond, as loop timers are, or more on a busy computer. Their time is the one that they
+    were scheduled for, so that delays do not add up over a chain of events; an event that needs an exact time must carry it.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
+        self._scheduled_ns: int | None = None
+        self._latest_ns = 0
 
     def now_ns(self) -> int:
-        """CLOCK_MONOTONIC in nanoseconds."""
-        return time.monotonic_ns()
+        """CLOCK_MONOTONIC in nanoseconds, in a callback when it should have been called; never goes back."""
+        now_ns = time.monotonic_ns() if self._scheduled_ns is None else self._scheduled_ns
+        self._latest_ns = max(self._latest_ns, now_ns)
+        return self._latest_ns
 
     def call_at(self, at_ns: int, callback: Callable[[], object]) -> Handle:
         """Call back in the loop's thread."""
-        return self._loop.call_later(max(0, at_ns - self.now_ns()) / 1e9, callback)
+
+        def call() -> None:
+            self._scheduled_ns = at_ns
+            try:
+                callback()
+            finally:
+                self._scheduled_ns = None
+
+        return self._loop.call_later(max(0, at_ns - time.monotonic_ns()) / 1e9, call)

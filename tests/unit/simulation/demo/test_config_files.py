@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 from tsgt.cli.composition import radio_key
+from tsgt.clock import SystemClock
 from tsgt.config import (
     ClientConfig,
     LeicaInstrumentConfig,
     MasterConfig,
     ReferencePointConfig,
     ScenarioConfig,
+    SimulatedImu,
     load,
     parameters,
     scenario_parameters,
 )
-from tsgt.simulation.demo import write_demo_files
+from tsgt.imu import HelloLine, SamplesLine, decode_program_line
+from tsgt.simulation.demo import Demo, write_demo_files
+from tsgt.simulation.demo.imu import ImuServer, imu_command
+from tsgt.simulation.imu import IMU_MODELS, ImuProgram, simulate_imu
+from tsgt.simulation.kernel import VirtualClock
+from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,6 +43,42 @@ def test_master_setup_equals_the_scenario(tmp_path: Path) -> None:
     scenario = ScenarioConfig(reference_point=lidar)
     files = write_demo_files(tmp_path, scenario, tmp_path / "poses.sock")
     assert parameters(load(files.master_config, MasterConfig)) == scenario_parameters(scenario)
+
+
+async def test_master_has_the_imu_of_the_robot(tmp_path: Path) -> None:
+    """As it is simulated; its program prints what comes from the socket of the demonstration."""
+    scenario = ScenarioConfig(imu=SimulatedImu(model="industrial"))
+    files = write_demo_files(tmp_path, scenario, tmp_path / "poses.sock")
+    demo = Demo(scenario, files, duration_s=1.0, seed=0, clock=VirtualClock(0))
+    config = load(files.master_config, MasterConfig)
+    assert parameters(config) == demo.parameters
+    assert demo.parameters.imu is not None
+    assert config.imu is not None
+    assert config.imu.command[-1] == str(files.imu_socket)
+
+
+@pytest.mark.slow
+async def test_program_prints_the_lines_of_the_socket(tmp_path: Path) -> None:
+    """Those from when it is started on, as often as it is."""
+    clock = SystemClock()
+    start_s = clock.monotonic_ns() / 1e9
+    world = scenario_world(ScenarioConfig(), 20.0, np.random.default_rng(0))
+    run = simulate_imu(SimulatedImu(model="industrial"), world.motion_at, 15.0, seed=[0])
+    samples = replace(run.samples, arrival_s=run.samples.arrival_s + start_s)
+    program = ImuProgram(IMU_MODELS["industrial"], samples, clock)
+    path = tmp_path / "imu.sock"
+    async with ImuServer(path, program, clock):
+        for _ in range(2):
+            process = await asyncio.create_subprocess_exec(*imu_command(path), stdout=asyncio.subprocess.PIPE)
+            assert process.stdout is not None
+            hello, first = await process.stdout.readline(), await process.stdout.readline()
+            assert isinstance(decode_program_line(hello), HelloLine)
+            line = decode_program_line(first)
+            assert isinstance(line, SamplesLine)
+            assert line.host_time_ns is not None
+            assert clock.monotonic_ns() - line.host_time_ns[-1] >= 0
+            process.terminate()
+            await process.wait()
 
 
 @pytest.mark.parametrize("protocol", ["superframe", "classic"])

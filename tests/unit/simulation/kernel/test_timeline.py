@@ -132,3 +132,33 @@ def test_loop_timeline_in_real_time() -> None:
         assert await reached >= start_ns + 5_000_000 - 1_000
 
     asyncio.run(main())
+
+
+def test_late_callbacks_have_the_time_they_were_scheduled_for() -> None:
+    """A loop that is busy does not slow a chain of events down, and time does not go back."""
+
+    async def main() -> None:
+        timeline = LoopTimeline(asyncio.get_running_loop())
+        start_ns = timeline.now_ns()
+        seen: list[int] = []
+        done = asyncio.Event()
+
+        def second() -> None:
+            seen.append(timeline.now_ns() - start_ns)
+            done.set()
+
+        def first() -> None:
+            seen.append(timeline.now_ns() - start_ns)
+            timeline.call_at(timeline.now_ns() + 2_000_000, second)
+
+        timeline.call_at(start_ns + 1_000_000, first)
+        time.sleep(0.02)  # noqa: ASYNC251 (the loop is busy)
+        await done.wait()
+        assert seen == [1_000_000, 3_000_000]
+        after_ns = timeline.now_ns()
+        assert after_ns - start_ns > 20_000_000
+        timeline.call_at(start_ns, lambda: seen.append(timeline.now_ns()))
+        await asyncio.sleep(0.001)
+        assert seen[-1] == after_ns
+
+    asyncio.run(main())

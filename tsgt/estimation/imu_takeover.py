@@ -222,7 +222,7 @@ class ImuTakeover:
 
     ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement.
     ``setup``: monitors the set-up of the IMU; None: nothing does. ``prisms``: of the layout. ``use``: whether poses rest on the
-    IMU, and why not. ``station_contradicted``: whether the IMU has contradicted the only station, and the trajectory follows it
+    IMU, and why not. ``station_contradicted``: whether the IMU has contradicted one or two stations, and the trajectory follows them
     nevertheless, because nothing tells which of the two is wrong.
     """
 
@@ -347,8 +347,8 @@ class ImuTakeover:
             self._next_comparison_s = now_s + COMPARISON_INTERVAL_S
             self._compare(now_s)
         found = self._found(now_s)
-        if self._prisms == 1:
-            self._watch_station(found)
+        if self._prisms < MIN_PRISMS:
+            self._watch_stations(found)
         if found in _WRONG:
             self._disagreement = self._untrusted or self._contradiction
             # What the samples show by themselves passes; whatever else it was may have come to stay.
@@ -378,13 +378,15 @@ class ImuTakeover:
         self._without.marginalise_before(before_s)
         self._with.marginalise_before(before_s)
 
-    def _watch_station(self, found: ImuUse) -> None:
-        """Note whether measurements of the only prism contradicted the IMU, and are followed from then on.
+    def _watch_stations(self, found: ImuUse) -> None:
+        """Note whether measurements of one or two prisms contradicted the IMU, and are followed from then on.
 
         A wrong one among right ones is an outlier, which is not followed. One alone that is followed is within what is possible: a
         station that has moved contradicts with the next one too.
         """
-        rejected = found == ImuUse.DISAGREES and DISAGREES_WITH_PRISMS in self._contradiction
+        rejected = (
+            self._prisms == 1 and found == ImuUse.DISAGREES and DISAGREES_WITH_PRISMS in self._contradiction
+        )
         followed = False
         if self._with.ambiguous:
             self._ambiguous_from_s = min(self._ambiguous_from_s, self._with.ambiguous_from_s)

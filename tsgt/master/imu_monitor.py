@@ -31,7 +31,7 @@ _CAUSES = {
 
 
 class ImuUseMonitor(Observer):
-    """Watches the predicted poses, and whether the IMU has contradicted the only station."""
+    """Watches the predicted poses, and whether the IMU has contradicted one or two stations."""
 
     def __init__(self) -> None:
         self._use = "starting"
@@ -48,7 +48,7 @@ class ImuUseMonitor(Observer):
         self._sigmas = _sigmas(record)
         if record.reason == "contradicted" and not self._contradicted:
             self._contradicted = True
-            events.append(_contradiction(record.stations[0].id, now_ns))
+            events.append(_contradiction([each.id for each in record.stations], now_ns))
         if record.imu != self._use:
             # While it is not used its cause may change; there is one event, and one when it is used again. There is none
             # for the first seconds, but for an IMU that is not used until the robot drives.
@@ -101,11 +101,16 @@ class OdometryUseMonitor(Observer):
         return []
 
 
-def _contradiction(station: int, now_ns: int) -> EventRecord:
+def _contradiction(stations: list[int], now_ns: int) -> EventRecord:
+    if len(stations) == 1:
+        measured, whose = f"station {stations[0]}", "its tripod or prism"
+    else:
+        measured, whose = f"stations {' and '.join(map(str, stations))}", "a tripod or prism"
     message = (
-        f"measurements of station {station} contradicted the IMU and went on from elsewhere: its tripod or prism may have moved; "
-        "poses are invalid until the master is restarted. Check the station first: tsgt calibrate check"
+        f"measurements of {measured} contradicted the IMU and went on from elsewhere: {whose} may have moved; "
+        "poses are invalid until the master is restarted. Check the stations first: tsgt calibrate check"
     )
+    station = stations[0] if len(stations) == 1 else None
     return EventRecord(stamp_ns=now_ns, event="station_contradicted", message=message, station=station)
 
 

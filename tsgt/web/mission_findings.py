@@ -135,7 +135,7 @@ def explanation(
         case "tilt":
             return "the robot would lean too far: prisms swapped or layout mirrored?"
         case "contradicted":
-            return "the IMU contradicted the only station: tripod or prism moved? Check them, then restart the master"
+            return "the IMU contradicted the stations: tripod or prism moved? Check them, then restart the master"
     return "the pose is invalid"
 
 

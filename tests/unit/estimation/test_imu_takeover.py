@@ -373,13 +373,14 @@ STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
         (1, 0.4, None, True),
         (1, 0.0, None, False),
         (1, None, None, False),
-        (2, 0.4, None, False),
+        (2, 0.4, None, True),
+        (3, 0.4, None, False),
         (1, None, DISAGREES, True),
         (1, None, STUCK, False),
         (2, None, DISAGREES, False),
     ],
 )
-def test_contradiction_of_the_only_station_lasts(
+def test_contradiction_of_one_or_two_stations_lasts(
     prisms: int, followed_for_s: float | None, health: str | None, *, contradicted: bool
 ) -> None:
     """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""

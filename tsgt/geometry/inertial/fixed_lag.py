@@ -25,7 +25,7 @@ from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
-from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
+from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
@@ -42,13 +42,14 @@ from tsgt.geometry.inertial.solver import (
     solve_inertial,
 )
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, Gravity, InertialStates, Mounting
-from tsgt.geometry.rigid import dot
+from tsgt.geometry.rigid import dot, exp_so3, log_so3
 from tsgt.geometry.trajectory.gauss_newton import (
     MAX_ITERATIONS,
     MIN_KNOT_SPACING_S,
     OUTLIER_THRESHOLD,
     add_measurements,
     nearest_knots,
+    robust_loss,
 )
 from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
 from tsgt.geometry.trajectory.measurement_factors import merge_observations, time_order
@@ -70,7 +71,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
-    from tsgt.model import ImuParameters, MotionPrior, OdometryParameters
+    from tsgt.model import ImuNoise, ImuParameters, MotionPrior, OdometryParameters
 
 SEARCH_S = 40.0  # Longest stretch of measurements that the search over headings takes
 SEARCH_GROWTH = (
@@ -82,6 +83,14 @@ CONSISTENT_ALONE = 5
 """Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
 each of them. A chance agreement of wrong ones within the gate, five times, is none.
 """
+MAX_START_COST = 3.0
+"""Of a start, per degree of freedom, without its outliers; 1 is expected. The first measurements of a station that has moved
+agree with the others within a few sigmas each, but not together as right ones do.
+"""
+MAX_ROTATION_SQUARES = 20.0
+"""Of the rotation of a start against that from before, normalised, three components; 2 in 10,000 exceed it."""
+ROTATION_MEMORY_S = 300.0
+"""For which a start must have the rotation from before: should that have been wrong itself, no start would be right."""
 WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
 UNKNOWN_SIGMA = 100.0  # Of positions in m and rotations in rad, of which nothing is known
@@ -91,6 +100,7 @@ _DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0], 3)
 """Sigmas of position, rotation and velocity of the first state's error, once measurements determine it: as without an IMU."""
 
 _POSE_DIM = 6
+_ROTATION_AND_BIAS = [3, 4, 5, 9, 10, 11]  # Of the gyro, in the error of a state
 
 
 class InertialFixedLagSmoother(MeasurementWindow):
@@ -146,6 +156,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._predictor: StrapdownPredictor | None = None
         self._searched: Observations | None = None  # Also those before the horizon, while there is no start
         self._next_search_s = -np.inf
+        self._known: _KnownRotation | None = None
 
     @property
     def initialised(self) -> bool:
@@ -361,6 +372,8 @@ class InertialFixedLagSmoother(MeasurementWindow):
     def _initialise(self, observations: Observations) -> None:
         self._converged, self._newest_nis = False, 0.0
         self._monitor.reset(observations)
+        if self._samples is not None and len(self._samples):
+            self._keep_rotation(float(observations.time_s[-1]))
         self._discard_trajectory()
         self.residuals_m = np.full((len(observations), 3), np.nan)
         if self._samples is None or not len(self._samples):
@@ -373,7 +386,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             observations = observations.select(observations.time_s >= begin_s)
         searched = observations if self._searched is None else self._searched
         searched = searched.select(searched.time_s >= begin_s)
-        found = self._search(searched)
+        found, consistent = self._search(searched)
         knots = found.knots
         prior = diffuse_inertial_prior(
             knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only, self._odometry
@@ -389,6 +402,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._anchor_displacement = None
         outliers = self._accept(self._mounted(searched), found.knot_index, found.gravity, found.factor, found)
         outliers = outliers[held]
+        self._converged &= consistent and self._keeps_rotation()
         if self._converged:
             if first > 0:
                 self._eliminate(searched, found.knot_index, first, ~held)
@@ -405,8 +419,38 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._select(observations.time_s >= middle_s)
             raise GeometryError("the measurements do not determine the trajectory")
 
-    def _search(self, observations: Observations) -> InertialSolution:
-        """Find the trajectory of measurements without any prior knowledge."""
+    def _keeps_rotation(self) -> bool:
+        """Whether the rotation of a start is the one from before, as the gyro has carried it on.
+
+        A tripod that has moved or tilted turns what two prisms tell of the rotation, or all that one tells of the heading.
+        """
+        assert self._solved is not None  # noqa: S101 (it was solved)
+        if self._known is None:
+            return True
+        knots = self._solved.window.knots
+        known = self._carried(self._known, float(knots.time_s[-1]))
+        turned = log_so3(known.rotation.T @ knots.rotation[-1])
+        covariance = known.covariance[:3, :3] + self._solved.factor.last_covariance()[3:6, 3:6]
+        return float(turned @ np.linalg.solve(covariance, turned)) < MAX_ROTATION_SQUARES
+
+    def _keep_rotation(self, newest_s: float) -> None:
+        """Remember the rotation that the measurements before the window told, or the one from before: newer ones may be wrong."""
+        known = self._known
+        if known is not None:
+            known = None if newest_s > known.until_s else self._carried(known, newest_s)
+        if self._window is not None:
+            lost = self._carried(_KnownRotation.of(self._window.anchor), newest_s)
+            # A trajectory that was lost soon knows less than the one before it.
+            if known is None or np.trace(lost.covariance[:3, :3]) < np.trace(known.covariance[:3, :3]):
+                known = lost
+        self._known = known
+
+    def _carried(self, known: _KnownRotation, time_s: float) -> _KnownRotation:
+        times_s = np.array([known.time_s, max(time_s, known.time_s)])
+        return known.carried(self._contiguous(times_s), float(times_s[1]), self._noise)
+
+    def _search(self, observations: Observations) -> tuple[InertialSolution, bool]:
+        """Find the trajectory of measurements without any prior knowledge, and whether they agree with it and with the samples."""
         if len(observations) < MIN_MEASUREMENTS:
             raise GeometryError("too few measurements")
         newest_s = float(observations.time_s[-1])
@@ -424,10 +468,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if not found.determined:
             raise GeometryError("the measurements do not tell the heading of the robot")
         start = found.solution
+        consistent = _is_consistent(start)
         if self._odometry is not None:
             setup = replace(setup, odometry=self._odometry)
-            return solve_inertial(mounted, setup, start.knots.with_wheels(), start.gravity)
-        return solve_inertial(mounted, setup, start.knots, start.gravity, factors=start.factors)
+            return solve_inertial(mounted, setup, start.knots.with_wheels(), start.gravity), consistent
+        return solve_inertial(mounted, setup, start.knots, start.gravity, factors=start.factors), consistent
 
     def _update_tracked(self, held: Observations, new: Observations) -> bool:
         assert self._window is not None  # noqa: S101 (converged)
@@ -458,6 +503,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         )
         if self._health.innovations(observations.time_s[is_new], observations.prism[is_new], nis):
             self._samples, self._searched, self._next_search_s = None, None, -np.inf
+            self._known = None
             return False
         weights = self._weigh(nis, sequential_nis)
         system.weights[is_new] = weights
@@ -664,6 +710,51 @@ class _Window:
             self.anchor,
             active=active,
             rejectable=rejectable,
+        )
+
+
+def _is_consistent(start: InertialSolution) -> bool:
+    """Whether measurements, samples and priors agree in a start, whose position, velocity and rotation are free."""
+    outliers = start.squared_distances >= OUTLIER_THRESHOLD**2
+    _, loss = robust_loss(start.squared_distances[outliers])
+    freedom = 3 * np.count_nonzero(~outliers) - len(_DIFFUSE_SIGMAS)
+    return start.cost - float(loss.sum()) < MAX_START_COST * freedom
+
+
+class _KnownRotation(NamedTuple):
+    """Rotation and bias of the gyro at a time, as long as they count."""
+
+    time_s: float
+    rotation: FloatArray  # (3, 3) of the IMU
+    gyro_bias: FloatArray  # (3,)
+    covariance: FloatArray  # (6, 6) of both
+    until_s: float
+
+    @classmethod
+    def of(cls, anchor: InertialAnchor) -> _KnownRotation:
+        """Return those that an anchor tells."""
+        point, mean = anchor.linearisation_point, anchor.mean[_ROTATION_AND_BIAS]
+        time_s = float(point.time_s[0])
+        return cls(
+            time_s,
+            point.rotation[0] @ exp_so3(mean[:3]),
+            point.gyro_bias[0] + mean[3:],
+            np.linalg.inv(anchor.information)[np.ix_(_ROTATION_AND_BIAS, _ROTATION_AND_BIAS)],
+            time_s + ROTATION_MEMORY_S,
+        )
+
+    def carried(self, samples: ContiguousSamples, time_s: float, noise: ImuNoise) -> _KnownRotation:
+        """Integrate samples up to a time."""
+        ends = np.array([self.time_s]), np.array([time_s])
+        found = preintegrate(samples, *ends, self.gyro_bias, np.zeros(3))
+        jacobian, added = np.eye(6), np.zeros((6, 6))
+        jacobian[:3, :3], jacobian[:3, 3:] = found.rotation[0].T, found.by_gyro_bias[0, 3:6]
+        added[:3, :3] = found.covariance[0, 3:6, 3:6]
+        added[3:, 3:] = noise.gyro_bias_walk**2 * (time_s - self.time_s) * np.eye(3)
+        return self._replace(
+            time_s=time_s,
+            rotation=self.rotation @ found.rotation[0],
+            covariance=jacobian @ self.covariance @ jacobian.T + added,
         )
 
 

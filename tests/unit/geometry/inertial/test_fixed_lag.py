@@ -238,6 +238,29 @@ def test_backlog_and_an_outage_at_once() -> None:
         assert np.abs(knots_s - time_s).min() <= 0.0101
 
 
+def test_no_wrong_start_after_a_tripod_has_tilted() -> None:
+    """Two prisms agree with a wrong rotation, but the gyro carries the right one on."""
+    observations = measurements(2)
+    moved = (observations.station == 0) & (observations.time_s > 4.0)
+    points = observations.points_m + moved[:, None] * np.array([0.0, 0.0, 0.03])
+    observations = replace(observations, points_m=points)
+    live = Live()
+    live.measure(observations.select(observations.time_s < 4.0))
+    assert live.window.converged
+    later = np.flatnonzero(observations.time_s > 4.0)
+    contradicted = False
+    for row in later:
+        live.measure(observations.select(slice(row, row + 1)))
+        time_s = float(observations.time_s[row])
+        if not live.window.converged or live.window.ambiguous:
+            contradicted = True
+            continue
+        state, covariance = live.window.trajectory().at(np.array([time_s]), dim=6)
+        error = difference(state.rotation, DRIVE.pose_at(np.array([time_s]))[1])[0]
+        assert error @ np.linalg.solve(covariance[0, 3:, 3:], error) < 30.0
+    assert contradicted
+
+
 @pytest.mark.slow
 def test_start_that_fails_after_the_window_has_moved_on() -> None:
     """Every sixth measurement of the only prism is wrong: no start, and no error though the search reaches back further."""

@@ -23,9 +23,10 @@ from tsgt.geometry.inertial.factors import (
 )
 from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
+from tsgt.geometry.inertial.known_rotation import KnownRotation
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.prediction import StrapdownPredictor
-from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous, preintegrate
+from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
 from tsgt.geometry.inertial.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
@@ -42,7 +43,7 @@ from tsgt.geometry.inertial.solver import (
     solve_inertial,
 )
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, Gravity, InertialStates, Mounting
-from tsgt.geometry.rigid import dot, exp_so3, log_so3
+from tsgt.geometry.rigid import dot, log_so3
 from tsgt.geometry.trajectory.gauss_newton import (
     MAX_ITERATIONS,
     MIN_KNOT_SPACING_S,
@@ -71,7 +72,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
-    from tsgt.model import ImuNoise, ImuParameters, MotionPrior, OdometryParameters
+    from tsgt.model import ImuParameters, MotionPrior, OdometryParameters
 
 SEARCH_S = 40.0  # Longest stretch of measurements that the search over headings takes
 SEARCH_GROWTH = (
@@ -89,8 +90,6 @@ agree with the others within a few sigmas each, but not together as right ones d
 """
 MAX_ROTATION_SQUARES = 20.0
 """Of the rotation of a start against that from before, normalised, three components; 2 in 10,000 exceed it."""
-ROTATION_MEMORY_S = 300.0
-"""For which a start must have the rotation from before: should that have been wrong itself, no start would be right."""
 WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
 UNKNOWN_SIGMA = 100.0  # Of positions in m and rotations in rad, of which nothing is known
@@ -100,7 +99,6 @@ _DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0], 3)
 """Sigmas of position, rotation and velocity of the first state's error, once measurements determine it: as without an IMU."""
 
 _POSE_DIM = 6
-_ROTATION_AND_BIAS = [3, 4, 5, 9, 10, 11]  # Of the gyro, in the error of a state
 
 
 class InertialFixedLagSmoother(MeasurementWindow):
@@ -156,7 +154,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._predictor: StrapdownPredictor | None = None
         self._searched: Observations | None = None  # Also those before the horizon, while there is no start
         self._next_search_s = -np.inf
-        self._known: _KnownRotation | None = None
+        self._known: KnownRotation | None = None
 
     @property
     def initialised(self) -> bool:
@@ -439,13 +437,13 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if known is not None:
             known = None if newest_s > known.until_s else self._carried(known, newest_s)
         if self._window is not None:
-            lost = self._carried(_KnownRotation.of(self._window.anchor), newest_s)
+            lost = self._carried(KnownRotation.of(self._window.anchor), newest_s)
             # A trajectory that was lost soon knows less than the one before it.
             if known is None or np.trace(lost.covariance[:3, :3]) < np.trace(known.covariance[:3, :3]):
                 known = lost
         self._known = known
 
-    def _carried(self, known: _KnownRotation, time_s: float) -> _KnownRotation:
+    def _carried(self, known: KnownRotation, time_s: float) -> KnownRotation:
         times_s = np.array([known.time_s, max(time_s, known.time_s)])
         return known.carried(self._contiguous(times_s), float(times_s[1]), self._noise)
 
@@ -718,44 +716,7 @@ def _is_consistent(start: InertialSolution) -> bool:
     outliers = start.squared_distances >= OUTLIER_THRESHOLD**2
     _, loss = robust_loss(start.squared_distances[outliers])
     freedom = 3 * np.count_nonzero(~outliers) - len(_DIFFUSE_SIGMAS)
-    return start.cost - float(loss.sum()) < MAX_START_COST * freedom
-
-
-class _KnownRotation(NamedTuple):
-    """Rotation and bias of the gyro at a time, as long as they count."""
-
-    time_s: float
-    rotation: FloatArray  # (3, 3) of the IMU
-    gyro_bias: FloatArray  # (3,)
-    covariance: FloatArray  # (6, 6) of both
-    until_s: float
-
-    @classmethod
-    def of(cls, anchor: InertialAnchor) -> _KnownRotation:
-        """Return those that an anchor tells."""
-        point, mean = anchor.linearisation_point, anchor.mean[_ROTATION_AND_BIAS]
-        time_s = float(point.time_s[0])
-        return cls(
-            time_s,
-            point.rotation[0] @ exp_so3(mean[:3]),
-            point.gyro_bias[0] + mean[3:],
-            np.linalg.inv(anchor.information)[np.ix_(_ROTATION_AND_BIAS, _ROTATION_AND_BIAS)],
-            time_s + ROTATION_MEMORY_S,
-        )
-
-    def carried(self, samples: ContiguousSamples, time_s: float, noise: ImuNoise) -> _KnownRotation:
-        """Integrate samples up to a time."""
-        ends = np.array([self.time_s]), np.array([time_s])
-        found = preintegrate(samples, *ends, self.gyro_bias, np.zeros(3))
-        jacobian, added = np.eye(6), np.zeros((6, 6))
-        jacobian[:3, :3], jacobian[:3, 3:] = found.rotation[0].T, found.by_gyro_bias[0, 3:6]
-        added[:3, :3] = found.covariance[0, 3:6, 3:6]
-        added[3:, 3:] = noise.gyro_bias_walk**2 * (time_s - self.time_s) * np.eye(3)
-        return self._replace(
-            time_s=time_s,
-            rotation=self.rotation @ found.rotation[0],
-            covariance=jacobian @ self.covariance @ jacobian.T + added,
-        )
+    return start.cost - float(loss.sum()) < MAX_START_COST * float(freedom)
 
 
 class _Solved(NamedTuple):

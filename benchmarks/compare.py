@@ -124,10 +124,19 @@ def errors(found: Fit, made: SimulatedEstimate) -> dict[str, float]:
 
 
 def frame_errors(relation: Relation, made: SimulatedEstimate) -> dict[str, float]:
-    """Return the errors of the frame by name, at the centroid of the estimate's positions as ``Fit`` defines them."""
-    true = made.truth.T_station1_frame
-    error = relation.T_station1_frame @ np.linalg.inv(true)
-    centroid_m = true[:3, :3] @ made.position_m.mean(axis=0) + true[:3, 3]
+    """Return the errors of the frame by name, at the centroid of the estimate's positions as ``Fit`` defines them.
+
+    The true frame is that of the estimate's start: stationary errors of the estimate, there averaged over a second, belong to it.
+    """
+    first = made.stamp_ns <= made.stamp_ns[0] + 1_000_000_000
+    estimated, true = made.T_station1_estimated[first], made.T_station1_sensor[first]
+    turn = exp_so3(log_so3(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)).mean(axis=0))
+    start_m = true[:, :3, 3].mean(axis=0)
+    shifted_m = start_m + (estimated - true)[:, :3, 3].mean(axis=0)
+    wrong = transform_from(turn, shifted_m - turn @ start_m)
+    started = np.linalg.inv(wrong) @ made.truth.T_station1_frame
+    error = relation.T_station1_frame @ np.linalg.inv(started)
+    centroid_m = started[:3, :3] @ made.position_m.mean(axis=0) + started[:3, 3]
     shift = error[:3, :3] @ centroid_m + error[:3, 3] - centroid_m
     return dict(zip(FRAME_NAMES, [*shift.tolist(), *log_so3(error[:3, :3]).tolist()], strict=True))
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.compare.drifting_frame import NAMES
-from tsgt.analysis.compare.frame_alignment import FRAME_NAMES, align_frame, drift_covariance
+from tsgt.analysis.compare.frame_alignment import FRAME_NAMES, align_frame, frame_covariance
 from tsgt.analysis.compare.interpolation import ReferenceTrajectory
 from tsgt.analysis.compare.joint_fit import JointFit, driven_m, fit_jointly
 from tsgt.analysis.compare.pairing import on_reference_clock
-from tsgt.analysis.compare.reference_error import at_sensor
+from tsgt.analysis.compare.reference_error import as_white, at_sensor
 from tsgt.analysis.compare.relation import Alignment, Fit, FitSettings, FittedPart, Relation, initial_relation
 from tsgt.geometry import rotate, transform_from
 
@@ -131,8 +131,10 @@ def _with_frame(joint: JointFit, align: Alignment, relation: Relation) -> _Frame
     own_m = relation.scale * rows.position_m
     arm_m = rotate(motion.rotation, relation.T_point_sensor[:3, 3])
     frame = align_frame(align, rows, own_m, sensor, np.ones(len(own_m)), good)
+    of_reference = None
     if joint.every.covariance is not None:
-        variance = np.einsum("nii->n", at_sensor(joint.every.covariance, arm_m)[:, :3, :3])
+        of_reference = at_sensor(joint.every.covariance, arm_m)
+        variance = np.einsum("nii->n", of_reference[:, :3, :3])
         excess = np.maximum(variance - np.median(variance[good]), 0.0)
         # Errors of an alignment are mostly drift: the reference counts less only where it adds to this.
         aligned = rotate(frame.T_station1_frame[:3, :3], own_m) + frame.T_station1_frame[:3, 3]
@@ -154,10 +156,14 @@ def _with_frame(joint: JointFit, align: Alignment, relation: Relation) -> _Frame
     pull = np.tensordot(error, by_unknowns[motion.known, :3], axes=([0, 1], [0, 1]))
     pull += np.concatenate([error.sum(axis=0), np.cross(about, error).sum(axis=0)]) @ change
     ate_m = math.sqrt(float((error**2).sum(axis=1).mean()))
+    if of_reference is not None:
+        of_reference = as_white(of_reference, float(np.median(np.diff(rows.since_first_s))))
     return _Framed(
         relation=replace(relation, T_station1_frame=frame.T_station1_frame),
         by_unknowns=change,
-        covariance=drift_covariance(frame, rows, aligned, joint.noise, driven_m(rows, joint.unknowns)),
+        covariance=frame_covariance(
+            frame, rows, aligned, joint.noise, driven_m(rows, joint.unknowns), of_reference
+        ),
         determined=frame.determined,
         ate_by_unknowns=pull / max(len(error) * ate_m, 1e-12),
     )

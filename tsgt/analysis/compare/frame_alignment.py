@@ -145,12 +145,17 @@ def _gains(
     return by_position, by_rotation, determined
 
 
-def drift_covariance(
-    frame: AlignedFrame, rows: Rows, aligned_m: FloatArray, noise: Noise, driven_m: FloatArray
+def frame_covariance(
+    frame: AlignedFrame,
+    rows: Rows,
+    aligned_m: FloatArray,
+    noise: Noise,
+    driven_m: FloatArray,
+    reference: FloatArray | None,
 ) -> FloatArray:
-    """Covariance, (6, 6), of a frame as that of the estimate's first pose, by the drift from there on and white noise.
+    """Covariance, (6, 6), of a frame as that of the estimate's first pose: by the drift from there on, white noise and the reference.
 
-    ``driven_m``: (K - 1,) from knot to knot.
+    ``driven_m``: (K - 1,) from knot to knot. ``reference``: (N, 6, 6) covariance of the sensor's poses, of white noise at these rows.
     """
     walk = noise.walk_per_s * rows.step_s[:, None] + noise.walk_per_m * driven_m[:, None]
     # A step of drift after a knot moves all later rows, and a step of its rotation turns them about the sensor there.
@@ -164,4 +169,7 @@ def drift_covariance(
     covariance = np.einsum("kij,kj,klj->il", by_step, walk, by_step)
     for gain, variance in ((frame.by_position, noise.white[:3]), (frame.by_rotation, noise.white[3:])):
         covariance += np.einsum("nij,j,nlj->il", gain, variance, gain)
+    if reference is not None:
+        gain = np.concatenate([frame.by_position, frame.by_rotation], axis=2)[frame.kept]
+        covariance += (gain @ reference[frame.kept] @ np.swapaxes(gain, 1, 2)).sum(axis=0)
     return np.asarray(covariance)

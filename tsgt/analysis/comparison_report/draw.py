@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 MAP_POINTS = 4000
 BUCKETS = 1500  # As curves are thinned
+WIDE_RANGE = 200.0  # Of a logarithmic axis, above which a narrow figure has room for powers of ten only
 _BAND = "#9ecae1"  # light enough for a black curve in front of it, in grey too
 _REFERENCE = "#808080"
 
@@ -235,6 +236,11 @@ def draw_steps(figure: Figure, found: Sequence[Comparison]) -> None:
     panel.set_yticks(np.arange(len(labels)) + 0.4 - 0.5 * height, [_wrapped(label) for label in labels])
     panel.invert_yaxis()
     plain_log(panel.xaxis)
+    low, high = panel.get_xlim()
+    if narrow(figure) and high > WIDE_RANGE * low:
+        from matplotlib.ticker import LogLocator  # noqa: PLC0415 (an extra)
+
+        panel.xaxis.set_major_locator(LogLocator())
     panel.set_xlabel("ATE position, rms (mm)")
     legend_above(figure, [panel])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tsgt.analysis.comparison_report.notes import notes
+from tsgt.analysis.comparison_report.notes import cautions, undetermined
 from tsgt.analysis.report import Headline, format_number
 
 if TYPE_CHECKING:
@@ -27,11 +27,22 @@ def comparison_headline(found: Sequence[Comparison]) -> Headline:
             caution.append(
                 f"{each.name}: its position error is below the reference's resolution; it may be better than this figure."
             )
-        caution += [f"{each.name}: {line}." for line in notes(each)]
+        caution += [f"{each.name}: {line}." for line in cautions(each)]
         if "extrinsic" in fair.settings.parts - each.settings.parts:
             repairs.append(
                 f"{each.name}: fit the extrinsic with `--fit offset,extrinsic`, or give it with `--extrinsic FILE`."
             )
+    weak = [
+        each.name
+        for each in found
+        if any(name.startswith("extrinsic") for name in (*each.weakly_determined, *undetermined(each)))
+        and "extrinsic" in each.settings.parts
+    ]
+    if weak:
+        repairs.append(
+            f"{', '.join(weak)}: for a closer extrinsic drive curves both ways with changing speed, on uneven ground, or give it from CAD "
+            "with its sigmas (`--extrinsic FILE`)."
+        )
     figures = tuple(
         (f"{each.name}, position rms", f"{format_number(each.errors.ate.errors.position_mm.rms)} mm")
         for each in found

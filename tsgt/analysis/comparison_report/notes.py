@@ -12,18 +12,27 @@ OVERCONFIDENT = 2.0  # Times the expected NEES, above which it is a remark
 
 
 def notes(each: Comparison) -> list[str]:
-    """Return what limits the figures of a comparison, a sentence each."""
-    lines = [*each.estimate.notes, *each.warnings]
-    undetermined = [name for name in each.unobservable if not _meaningless(each, name)]
-    if undetermined:
-        names = ", ".join(component_text(name) for name in undetermined)
+    """Return what limits the figures of a comparison, and what was left out or repaired, a sentence each."""
+    lines = [*each.estimate.notes, *cautions(each), *_left_out(each)]
+    if each.errors.drift.shortened and each.errors.drift.segments:
+        longest = each.errors.drift.segments[-1].length_m
+        lines.append(
+            f"the path is too short for KITTI's segments; drift is over segments of up to {longest:g} m"
+        )
+    return lines
+
+
+def cautions(each: Comparison) -> list[str]:
+    """Return what makes figures of a comparison less than they seem, a sentence each."""
+    lines = list(each.warnings)
+    if undetermined(each):
+        names = ", ".join(component_text(name) for name in undetermined(each))
         lines.append(f"undetermined by this motion, left as given: {names}")
     if each.weakly_determined:
         weak = ", ".join(_with_sigma(name, sigma) for name, sigma in each.weakly_determined.items())
         lines.append(
             f"weakly determined by this motion, not within 1 ms, 5 mm or 0.1° at two sigmas: {weak} (sigma)"
         )
-    lines += _left_out(each)
     c = each.errors.completeness
     if c.diverged_s is not None:
         lines.append(f"diverged {c.diverged_s:.0f} s after its start; all figures include that")
@@ -39,17 +48,21 @@ def notes(each: Comparison) -> list[str]:
             "use `--fit offset,extrinsic`, or `--extrinsic FILE`"
         )
     nees = each.errors.nees
-    if nees is not None and nees.statistics.mean > OVERCONFIDENT * nees.degrees_of_freedom:
+    if (
+        nees is not None
+        and _comparable(each)
+        and nees.statistics.mean > OVERCONFIDENT * nees.degrees_of_freedom
+    ):
         factor = nees.statistics.mean / nees.degrees_of_freedom
         lines.append(
             f"its covariance is too small: squared errors are {factor:.1f} times what it states (NEES)"
         )
-    if each.errors.drift.shortened and each.errors.drift.segments:
-        longest = each.errors.drift.segments[-1].length_m
-        lines.append(
-            f"the path is too short for KITTI's segments; drift is over segments of up to {longest:g} m"
-        )
     return lines
+
+
+def undetermined(each: Comparison) -> list[str]:
+    """Return the unknowns that the motion does not determine, without those that the estimate does not have."""
+    return [name for name in each.unobservable if not _meaningless(each, name)]
 
 
 def _left_out(each: Comparison) -> list[str]:
@@ -60,6 +73,16 @@ def _left_out(each: Comparison) -> list[str]:
         (c.reference_weak, "where the reference is less certain than asked for"),
     )
     return [f"{count} of {c.poses} poses left out {where}" for count, where in reasons if count]
+
+
+def _comparable(each: Comparison) -> bool:
+    """Return whether errors are those that a covariance states.
+
+    That of odometry grows from the start, whose pose an alignment over all moves; positions of the start alone show no direction.
+    """
+    if "frame" not in each.settings.parts:
+        return True
+    return (each.settings.align == "start") == (each.estimate.orientation_xyzw is not None)
 
 
 def _with_sigma(name: str, sigma: float) -> str:

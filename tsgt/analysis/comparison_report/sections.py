@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.compare import Comparison
 
+_FAIREST = "\N{BLACK DIAMOND}"
+
 
 def comparison_map(found: Sequence[Comparison]) -> ReportFigure:
     """Return the map."""
@@ -133,30 +135,40 @@ def _consistency(found: Sequence[Comparison]) -> list[Table]:
 
 
 def _relations(found: Sequence[Comparison]) -> Section:
-    rows = []
+    places, turns = [], []
+    has_scale = any("scale" in each.settings.parts for each in found)
     for each in found:
         relation, sigma = each.fit.relation, each.extrinsic_sigma
         position_mm = 1e3 * relation.T_point_sensor[:3, 3]
         rotation_deg = np.degrees(log_so3(relation.T_point_sensor[:3, :3]))
-        rows.append(
+        scale = _with_sigma(relation.scale, float(each.sigma("scale")[0]), 5)
+        places.append(
             (
                 each.name,
                 _with_sigma(1e3 * relation.offset_s, 1e3 * float(each.sigma("offset_s")[0]), 2),
                 *(_with_sigma(v, 1e3 * s, 1) for v, s in zip(position_mm, sigma[:3], strict=True)),
-                *(_with_sigma(v, math.degrees(s), 3) for v, s in zip(rotation_deg, sigma[3:], strict=True)),
-                _with_sigma(relation.scale, float(each.sigma("scale")[0]), 5),
+                *((scale,) if has_scale else ()),
             )
         )
-    table = Table(
-        "Time on the reference's clock less the estimate's stamp; position and rotation vector of the sensor in the axes of the "
-        "reference's point; scale. One sigma, which allows for the estimate's drift; without one it was not fitted",
-        (
-            *("estimate", "offset (ms)", "x (mm)", "y (mm)", "z (mm)"),
-            *("rotation x (deg)", "rotation y (deg)", "rotation z (deg)", "scale"),
-        ),
-        tuple(rows),
-    )
-    return Section("What stands between estimate and reference", tables=(table,))
+        turned = [_with_sigma(v, math.degrees(s), 3) for v, s in zip(rotation_deg, sigma[3:], strict=True)]
+        if each.errors.pairs.has_orientation:
+            turns.append((each.name, *turned))
+    header = ("estimate", "offset (ms)", "x (mm)", "y (mm)", "z (mm)", *(("scale",) if has_scale else ()))
+    tables = [
+        Table(
+            "Time on the reference's clock less the estimate's stamp, and position of the sensor in the axes of the reference's "
+            "point. One sigma, which allows for the estimate's drift; without one it was not fitted",
+            header,
+            tuple(places),
+        )
+    ]
+    if turns:
+        tables.append(
+            Table(
+                "Rotation vector of the sensor", ("estimate", "x (deg)", "y (deg)", "z (deg)"), tuple(turns)
+            )
+        )
+    return Section("What stands between estimate and reference", tables=tuple(tables))
 
 
 def _with_sigma(value: float, sigma: float, digits: int) -> str:
@@ -169,19 +181,23 @@ def _with_sigma(value: float, sigma: float, digits: int) -> str:
 
 
 def _hidden(found: Sequence[Comparison]) -> Section:
-    rows = [
-        (
-            f"{each.name}: {step.label}",
-            format_number(step.ate.errors.position_mm.rms),
-            format_number(step.ate.errors.orientation_deg.rms, 3),
-            "smallest fair set" if row == each.smallest_fair else "" if step.fair else "hides drift",
-        )
-        for each in found
-        for row, step in enumerate(each.steps)
+    labels = list(dict.fromkeys(step.label for each in found for step in each.steps))
+    positions, rotations = [], []
+    for label in labels:
+        steps = [next((step for step in each.steps if step.label == label), None) for each in found]
+        fairest = [step is each.steps[each.smallest_fair] for each, step in zip(found, steps, strict=True)]
+        for rows, name, digits in ((positions, "position_mm", 1), (rotations, "orientation_deg", 3)):
+            values = [math.nan if step is None else getattr(step.ate.errors, name).rms for step in steps]
+            cells = [format_number(value, digits) for value in values]
+            marked = [
+                f"{_FAIREST} {cell}" if fair else cell for cell, fair in zip(cells, fairest, strict=True)
+            ]
+            rows.append((label, *marked))
+    header = ("fitted", *(each.name for each in found))
+    tables = [
+        Table(f"Position error, rms in mm. {_FAIREST}: smallest fair set", header, tuple(positions)),
+        Table(f"Rotation error, rms in degrees. {_FAIREST}: smallest fair set", header, tuple(rotations)),
     ]
-    table = Table(
-        "Error with growing sets of fitted quantities", ("fitted", "rms (mm)", "rms (deg)", ""), tuple(rows)
-    )
     plot = ReportFigure(
         "fit",
         "What each fitted quantity hides",
@@ -194,7 +210,7 @@ def _hidden(found: Sequence[Comparison]) -> Section:
         "poses, or a scale, also hides drift. The smallest fair set is the first from which on no fair quantity reduces an error by "
         "more than 5 %."
     )
-    return Section("What the fit hides", (text,), (table,), (plot,))
+    return Section("What the fit hides", (text,), tuple(tables), (plot,))
 
 
 def _over_time(found: Sequence[Comparison], axis: TimeAxis) -> Section:
@@ -213,6 +229,7 @@ def _over_time(found: Sequence[Comparison], axis: TimeAxis) -> Section:
             "Path of the reference, coloured by the position error of each estimate.",
             20.0 + 55.0 * -(-len(found) // 3),
             lambda figure: draw.draw_error_maps(figure, found),
+            narrow_height_mm=20.0 + 45.0 * len(found),
         ),
     ]
     plots += [
@@ -266,11 +283,11 @@ def _motions(found: Sequence[Comparison]) -> Section:
         ("estimate, length", "segments", "position (%)", "explained (%)", "rotation (deg/m)"),
         tuple(segments),
     )
-    text = [
-        f"{each.name}: drift {format_number(each.errors.drift.position_mm_per_m, 2)} mm and "
-        f"{format_number(each.errors.drift.orientation_deg_per_m, 4)} degrees per metre."
-        for each in found
-    ]
+    text = []
+    for each in found:
+        drift_mm, drift_deg = each.errors.drift.position_mm_per_m, each.errors.drift.orientation_deg_per_m
+        turned = f" and {format_number(drift_deg, 4)} degrees" if math.isfinite(drift_deg) else ""
+        text.append(f"{each.name}: drift {format_number(drift_mm, 2)} mm{turned} per metre.")
     if any(each.errors.drift.shortened for each in found):
         text.append("The path is too short for KITTI's segments of 100 m to 800 m; shorter ones are used.")
     plot = ReportFigure(
@@ -340,7 +357,8 @@ def _completeness(found: Sequence[Comparison]) -> Section:
                 tuple(events),
             )
         )
-    return Section("Completeness", tables=tuple(tables))
+    repaired = tuple(f"{each.name}: {note}." for each in found for note in each.estimate.notes)
+    return Section("Completeness", repaired, tuple(tables))
 
 
 def _jump(position_m: float, rotation_rad: float) -> str:

@@ -55,6 +55,7 @@ class ReportFigure:
     caption: str
     height_mm: float
     fill: Callable[[Figure], None]
+    narrow_height_mm: float | None = None  # None: the same
 
     def write(self, paths: Sequence[Path]) -> None:
         """Draw it at page width and write the given files."""
@@ -65,7 +66,8 @@ class ReportFigure:
 
     def narrow_png(self) -> bytes:
         """Draw it for a narrow screen."""
-        with drawing(width_mm=COLUMN_WIDTH_MM, height_mm=self.height_mm) as figure:
+        height_mm = self.height_mm if self.narrow_height_mm is None else self.narrow_height_mm
+        with drawing(width_mm=COLUMN_WIDTH_MM, height_mm=height_mm) as figure:
             self.fill(figure)
             return png_bytes(figure)
 

@@ -6,7 +6,7 @@ import difflib
 from dataclasses import dataclass
 from enum import StrEnum
 
-from tsgt.setup.template import sealed_by_setup
+from tsgt.setup.template import content_lines, sealed_by_setup
 
 
 class State(StrEnum):
@@ -33,7 +33,7 @@ def compare_configuration(before: str | None, new: str, name: str) -> Configurat
     if before == new:
         return ConfigurationState(State.SAME)
     lines = difflib.unified_diff(
-        before.splitlines(), new.splitlines(), name, f"{name} as setup would write it", n=0, lineterm=""
+        content_lines(before), content_lines(new), name, f"{name} as setup would write it", n=0, lineterm=""
     )
     state = State.FROM_SETUP if sealed_by_setup(before) else State.EDITED
     return ConfigurationState(state, tuple(lines))

@@ -102,9 +102,13 @@ def _sealed(text: str) -> str:
     return text.replace(f"{_MARK}\n", f"{_MARK}{_check_sum(text)}\n")
 
 
+def content_lines(text: str) -> list[str]:
+    """Return the lines of a configuration but for the check sum."""
+    return [line for line in text.splitlines() if not line.startswith(_MARK)]
+
+
 def _check_sum(text: str) -> str:
-    lines = [line for line in text.splitlines() if not line.startswith(_MARK)]
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    return hashlib.sha256("\n".join(content_lines(text)).encode()).hexdigest()[:16]
 
 
 def _radio_text(radio: RadioAnswers) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.cli.setup.common import configuration_before, configure, prepare, radio_of
-from tsgt.cli.setup.mission import mission_key, mission_of, mission_of_master, show_mission
+from tsgt.cli.setup.mission import channel_text, mission_key, mission_of, mission_of_master, show_mission
 from tsgt.cli.setup.options import answer
 from tsgt.cli.setup.session import SetupStopped
 from tsgt.config import MasterConfig
@@ -61,6 +61,11 @@ def run_master_setup(common: Common, *, region: str | None, stations: int | None
         kept = config is not None and before is not None and before.radio.region == chosen_region
         shared = (
             mission_of(config.radio, key) if kept and config is not None else _new_mission(chosen_region, key)
+        )
+        session.report(
+            "mission",
+            ok=True,
+            detail=f"{channel_text(shared)}; {'a new key' if made else 'the key of before'}",
         )
         radio = radio_of(session, common, shared, None if before is None else before.radio)
         answers = MasterAnswers(stations=count, radio=radio)

@@ -54,6 +54,12 @@ def mission_of(radio: ModemConfig, key: bytes) -> Mission:
     )
 
 
+def channel_text(mission: Mission) -> str:
+    """Return the channel of a mission as text."""
+    region = f", {mission.region}" if mission.region else ""
+    return f"{mission.frequency_hz / 1e6:g} MHz, SF {mission.spreading_factor}, {mission.bandwidth_hz / 1e3:g} kHz{region}"
+
+
 def given_mission(session: Session, given: str | None, before: Mission | None) -> Mission:
     """Return the mission that a station takes part in: that of a file or text, or the one of before.
 

@@ -17,7 +17,7 @@ from tsgt.cli.setup.common import (
     prepare,
     radio_of,
 )
-from tsgt.cli.setup.mission import given_mission, mission_key, mission_of
+from tsgt.cli.setup.mission import channel_text, given_mission, mission_key, mission_of
 from tsgt.cli.setup.options import answer
 from tsgt.cli.setup.session import SetupStopped
 from tsgt.config import ClientConfig, InstrumentPort, TcpAddress
@@ -130,11 +130,7 @@ def _mission(session: Session, given: str | None, config: ClientConfig | None) -
         shared = given_mission(session, given, known)
     except MissionError as error:
         session.fail("mission", str(error))
-    detail = (
-        f"{shared.frequency_hz / 1e6:g} MHz, SF {shared.spreading_factor}, {shared.bandwidth_hz / 1e3:g} kHz"
-        f"{f', {shared.region}' if shared.region else ''}; check sum right"
-    )
-    session.report("mission", ok=True, detail=detail)
+    session.report("mission", ok=True, detail=f"{channel_text(shared)}; check sum right")
     return shared
 
 

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from tsgt.config import InstrumentModelConfig, LeicaInstrumentConfig, ScenarioConfig, SimulatedStation
+from tsgt.config import (
+    InstrumentModelConfig,
+    LeicaInstrumentConfig,
+    MotionConfig,
+    ScenarioConfig,
+    SimulatedStation,
+)
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.world import scenario_world
@@ -81,6 +87,7 @@ async def leica_bench(
     model: InstrumentModelConfig | None = None,
     seed: int = 2,
     duration_s: float = 300.0,
+    motion: MotionConfig | None = None,
 ) -> AsyncGenerator[LeicaBench]:
     """Set up a disconnected driver for the duration of the block."""
     stations = tuple(
@@ -93,7 +100,9 @@ async def leica_bench(
         )
         for number, position_m in ((1, (0.0, 0.0, 0.0)), (2, (2.0, -1.5, 0.1)), (3, (-1.5, 2.5, -0.2)))
     )
-    scenario = ScenarioConfig(stations=stations, targets_m=TARGETS_M, faults=tuple(faults))
+    scenario = ScenarioConfig(
+        stations=stations, targets_m=TARGETS_M, faults=tuple(faults), motion=motion or MotionConfig()
+    )
     world = scenario_world(scenario, duration_s, np.random.default_rng(1))
     timeline = cast("VirtualEventLoop", asyncio.get_running_loop())._timeline
     clock = VirtualClock(0)

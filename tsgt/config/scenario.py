@@ -119,6 +119,8 @@ class ScenarioRadioConfig(Model):
 class InstrumentModelConfig(Model):
     """Behaviour of a simulated total station; the defaults come from public recordings and manuals."""
 
+    generation: Literal["TPS1100", "TPS1200", "TPS1200+", "TS15", "MS50", "TS16", "MS60"] = "TPS1200+"
+    """What it knows of GeoCOM; an MS50 or MS60 also stands for TS50 and TS60."""
     tick_jitter_ms: NotNegative = 4.0
     """Jitter of the measurement instants, one sigma."""
     processing_min_ms: NotNegative = 20.0

@@ -19,6 +19,7 @@ from tsgt.simulation.instrument.edm import (
     atmospheric_ppm,
     measure_polar,
 )
+from tsgt.simulation.instrument.generations import GENERATIONS
 from tsgt.simulation.instrument.lock_drift import LockDrift
 from tsgt.simulation.instrument.settings import COMPENSATOR_SIGMA_RAD, PRISM_CONSTANTS_M, TAPE, Settings
 from tsgt.simulation.instrument.targets_in_view import TargetsInView, direction_to
@@ -120,7 +121,8 @@ class TotalStationModel:
         self.external_power = False
         self.tilt_rad = (3.0 * ARCSECOND_RAD, -2.0 * ARCSECOND_RAD)
         self.air = (12.0, 1013.25)
-        self.name = "TCRP1201+"
+        self.generation = GENERATIONS[model.generation]
+        self.name = self.generation.name
         self.serial_number = 230_000 + station.station
         self.reported_distances: list[ReportedDistance] = []  # each reported distance once
         self.beeps: list[int] = []  # True times of beeps in ns

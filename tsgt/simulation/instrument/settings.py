@@ -32,11 +32,8 @@ PRISM_CONSTANTS_M: Final = {
 }
 """Leica prism constants by prism type; user-defined types have their own."""
 
-EDM_MODES: Final = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12})
-"""Modes of a TPS1200+; 13 and 14 came with the TS30."""
-
 MODE_OF_PROGRAM: Final = {0: 2, 1: 3, 2: 4, 3: 5, 4: 7, 6: 8, 7: 10, 8: 11, 9: 12, 10: 9}
-"""EDM mode by BAP measuring program; a TPS1200+ has no program 5 (fast tracking)."""
+"""EDM mode by BAP measuring program."""
 
 
 @dataclass(slots=True)

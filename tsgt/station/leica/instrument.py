@@ -18,13 +18,13 @@ from tsgt.station.leica.reacquisition import ReacquisitionSequence
 from tsgt.station.leica.search import RoboticLicenceMissing, TargetSearch
 from tsgt.station.leica.setup import (
     DECIMALS,
-    TRACKING_MODES,
     apply_setting,
     atmospheric_correction,
     clear_distance,
     read_settings,
     set_distance_mode,
     set_reflector,
+    set_tracking_mode,
     set_up,
 )
 from tsgt.station.leica.target import measure_in_two_faces, measure_target
@@ -147,7 +147,7 @@ class LeicaInstrument:
             config = self._config
             constant_m = None if config.prism_constant_mm is None else config.prism_constant_mm / 1e3
             self._add_problem(await set_reflector(line, config.prism_type, constant_m))
-            self._add_problem(await set_distance_mode(line, TRACKING_MODES[config.distance_mode]))
+            self._add_problem(await set_tracking_mode(line, config.distance_mode))
             tracking = Tracking(
                 line, self._clock, self._timestamper, self._sequence, self._target_search(line)
             )

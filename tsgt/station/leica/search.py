@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from tsgt.station.geocom import Outcome, ReturnCode, Rpc, outcome_of
+import structlog
+
+from tsgt.station.geocom import Outcome, ReturnCode, Rpc, name_of, outcome_of
 from tsgt.station.leica.identity import numeric_values, succeeded
 from tsgt.station.leica.reacquisition import (
     ATR_FIELD_OF_VIEW_RAD,
@@ -18,6 +20,8 @@ from tsgt.station.leica.reacquisition import (
 if TYPE_CHECKING:
     from tsgt.station.geocom import GeoComConnection, Parameter, Reply
 
+log = structlog.get_logger()
+
 _TRIES: Final = 3
 _TURN_TIMEOUT_S: Final = 30.0
 _FINE_ADJUST_TIMEOUT_S: Final = 15.0  # the instrument gives up after 5 s
@@ -27,6 +31,9 @@ _CLOCKWISE, _WITH_SWING = 1, 1
 _MAX_SWEEPS: Final = 3
 _HERE: Final = SearchWindow("pointing at it", False, None, ATR_FIELD_OF_VIEW_RAD, ATR_FIELD_OF_VIEW_RAD)
 _NEARBY: Final = SearchWindow("searching nearby", True, None, MAX_FINE_ADJUST_RAD, MAX_FINE_ADJUST_RAD)
+
+
+_UNAVAILABLE: Final = frozenset({Outcome.UNAVAILABLE, Outcome.LICENCE})
 
 
 class RoboticLicenceMissing(Exception):  # noqa: N818 (not an error: the operator takes over)
@@ -98,16 +105,29 @@ class TargetSearch:
         await self._adjust(_HERE)
 
     async def _sweep(self, window: SearchWindow) -> Reply:
-        if not self._power_search:
-            area = min(window.width_rad, math.pi), window.height_rad, 0
-            return await self._call(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_TIMEOUT_S)
+        if self._power_search:
+            reply = await self._sweep_by_power_search(window)
+            if outcome_of(reply.code, has_values=False) not in _UNAVAILABLE:
+                return reply
+            # The licence is present, as other procedures need it, too.
+            self._power_search = False
+            log.warning("power_search_unavailable", code=name_of(reply.code))
+            if window.centre is not None:
+                await self._call(Rpc.AUT_MAKE_POSITIONING, *window.centre, 0, 0, 0, timeout_s=_TURN_TIMEOUT_S)
+        area = min(window.width_rad, math.pi), window.height_rad, 0
+        return await self._call(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_TIMEOUT_S)
+
+    async def _sweep_by_power_search(self, window: SearchWindow) -> Reply:
         if window.is_full_circle:
-            return await self._call(
+            return await self._line.call(
                 Rpc.AUT_PS_SEARCH_NEXT, _CLOCKWISE, _WITH_SWING, timeout_s=_FULL_CIRCLE_TIMEOUT_S
             )
         centre = window.centre or await pointing(self._line) or Pointing(0.0, math.pi / 2)
-        await self._call(Rpc.AUT_SET_SEARCH_AREA, *centre, window.width_rad, window.height_rad, 1)
-        return await self._call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=_WINDOW_TIMEOUT_S)
+        area = window.width_rad, window.height_rad, 1
+        reply = await self._line.call(Rpc.AUT_SET_SEARCH_AREA, *centre, *area)
+        if outcome_of(reply.code, has_values=False) in _UNAVAILABLE:
+            return reply
+        return await self._line.call(Rpc.AUT_PS_SEARCH_WINDOW, timeout_s=_WINDOW_TIMEOUT_S)
 
     async def _call(self, rpc: Rpc, *parameters: Parameter, timeout_s: float = 3.0) -> Reply:
         reply = await self._line.call(rpc, *parameters, timeout_s=timeout_s)

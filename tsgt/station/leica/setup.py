@@ -255,6 +255,16 @@ def _has_constant(now_m: Numbers | None, required_m: float | None) -> bool:
     return now_m is not None and (required_m is None or abs(now_m[0] - required_m) < _CONSTANT_TOLERANCE_M)
 
 
+async def set_tracking_mode(line: GeoComConnection, mode: str) -> str:
+    """Set a mode of ``TRACKING_MODES``; where the instrument lacks it, use the fastest that it has, and return the problem."""
+    problem = await set_distance_mode(line, TRACKING_MODES[mode])
+    if problem and mode != "auto" and not await set_distance_mode(line, TRACKING_MODES["auto"]):
+        now = numeric_values(await line.call(Rpc.TMC_GET_EDM_MODE), 1)
+        used = EDM_MODES.get(int(now[0]), "") if now is not None else ""
+        problem += f"; {used or 'another mode'} is used"
+    return problem
+
+
 async def set_distance_mode(line: GeoComConnection, modes: tuple[int, ...]) -> str:
     """Set the first EDM mode that the instrument accepts, or synchronous tracking if there is none; return the problem."""
     now = numeric_values(await line.call(Rpc.TMC_GET_EDM_MODE), 1)

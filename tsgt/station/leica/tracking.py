@@ -260,7 +260,8 @@ class Tracking:
         outcome = outcome_of(reply.code, has_values=bool(reply.values))
         if outcome is Outcome.SHUT_DOWN:
             raise InstrumentError("the instrument is switching off")
-        self._unavailable = self._unavailable + 1 if outcome is Outcome.UNAVAILABLE else 0
+        unavailable = outcome in (Outcome.UNAVAILABLE, Outcome.LICENCE)
+        self._unavailable = self._unavailable + 1 if unavailable else 0
         if self._unavailable >= _MAX_UNAVAILABLE:
             raise InstrumentError(
                 f"the instrument does not support TMC_GetFullMeas ({name_of(reply.code)}), so that distances have no times;"

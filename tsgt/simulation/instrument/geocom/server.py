@@ -79,6 +79,8 @@ class GeoComServer:
         self._event: Handle | None = None
         self.on_send: Callable[[bytes], None] = lambda _: None
         self.forced: deque[ForcedResponse] = deque()  # responses to force
+        # Code of a procedure that it does not have: 5 or 27 on some firmware. None: the request is not understood.
+        self.unknown_code: ReturnCode | None = None
 
     def receive(self, data: bytes) -> None:
         """Process bytes. CR or LF ends a line; empty lines are ignored."""
@@ -135,8 +137,8 @@ class GeoComServer:
             self._finish(Response(forced.code, com_code=forced.com_code))
             return
         command = COMMANDS.get(request.rpc)
-        if command is None:
-            self._reject(request, ReturnCode.COM_PROC_UNAVAIL)
+        if command is None or request.rpc in self._station.generation.unknown:
+            self._reject_unknown(request)
             return
         signature, execute = command
         try:
@@ -167,6 +169,13 @@ class GeoComServer:
     def _reject(self, request: _Request, com_code: int) -> None:
         self._request = request
         self._finish(Response(com_code=com_code))
+
+    def _reject_unknown(self, request: _Request) -> None:
+        if self.unknown_code is None:
+            self._reject(request, ReturnCode.COM_PROC_UNAVAIL)
+        else:
+            self._request = request
+            self._finish(Response(self.unknown_code))
 
     def _finish(self, response: Response) -> None:
         """Send a response after the processing time."""

@@ -14,7 +14,7 @@ from tsgt.simulation.instrument.geocom.commands import (
     setter,
     values,
 )
-from tsgt.simulation.instrument.settings import EDM_MODES, MODE_OF_PROGRAM, PRISM_CONSTANTS_M, USER_PRISM
+from tsgt.simulation.instrument.settings import MODE_OF_PROGRAM, PRISM_CONSTANTS_M, USER_PRISM
 from tsgt.simulation.instrument.visibility import HALF_FIELD_OF_VIEW_RAD, REDUCED_HALF_FIELD_OF_VIEW_RAD
 from tsgt.station.geocom import ReturnCode, Rpc
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from tsgt.simulation.instrument.geocom.commands import Commands
     from tsgt.simulation.instrument.model import TotalStationModel
 
-_MOTORS, _ATR, _REFLECTORLESS, _POWER_SEARCH, _SIMULATOR = 0x4, 0x8, 0x400, 0x800, 0x4000
 _LOW_PERCENT, _EMPTY_PERCENT = 15.0, 3.0
 _CLASS_TPS1201: Final = 100
 _DATE: Final = (2026, 7, 1, 8, 0, 0, 0)
@@ -60,7 +59,7 @@ def _beep(station: TotalStationModel, *_volume: int) -> Response:
 
 
 def _set_edm_mode(station: TotalStationModel, mode: int) -> Response:
-    if mode not in EDM_MODES:
+    if mode not in station.generation.edm_modes:
         return INVALID_PARAMETER
     now_ns = station.advance()
     if mode not in CONTINUOUS_MODES:
@@ -70,9 +69,9 @@ def _set_edm_mode(station: TotalStationModel, mode: int) -> Response:
 
 
 def _set_program(station: TotalStationModel, program: int) -> Response:
-    mode = MODE_OF_PROGRAM.get(program)
-    if mode is None:
+    if program not in station.generation.programs:
         return INVALID_PARAMETER
+    mode = MODE_OF_PROGRAM[program]
     station.settings.program = program
     return _set_edm_mode(station, mode)
 
@@ -80,12 +79,12 @@ def _set_program(station: TotalStationModel, program: int) -> Response:
 def _set_prism_type(station: TotalStationModel, prism_type: int, _name: str = "") -> Response:
     """Set the prism type and its prism constant."""
     settings = station.settings
+    if prism_type not in station.generation.prism_types:
+        return INVALID_PARAMETER
     if prism_type == USER_PRISM:
         settings.prism_constant_m = settings.user_constant_m
-    elif prism_type in PRISM_CONSTANTS_M:
-        settings.prism_constant_m = PRISM_CONSTANTS_M[prism_type]
     else:
-        return INVALID_PARAMETER
+        settings.prism_constant_m = PRISM_CONSTANTS_M[prism_type]
     station.advance()
     settings.prism_type = prism_type
     return OK
@@ -190,10 +189,7 @@ _IDENTITY: Commands = {
     Rpc.CSV_GET_DATE_TIME_CENTI_SEC: Command("", lambda _: values(*_DATE)),
     Rpc.CSV_GET_INT_TEMP: Command("", lambda s: values(s.air[0] + 9.0)),
     Rpc.CSV_GET_SW_VERSION: Command("", lambda _: values(5, 50, 0)),
-    Rpc.CSV_GET_DEVICE_CONFIG: Command(
-        "",
-        lambda _: values(_CLASS_TPS1201, _MOTORS | _ATR | _REFLECTORLESS | _POWER_SEARCH | _SIMULATOR),
-    ),
+    Rpc.CSV_GET_DEVICE_CONFIG: Command("", lambda s: values(_CLASS_TPS1201, s.generation.devices)),
     Rpc.CSV_GET_REFLECTORLESS_CLASS: Command("", lambda _: values(300)),
     Rpc.CSV_CHECK_POWER: Command("", _check_power),
     Rpc.CTL_GET_UP_COUNTER: Command("", lambda _: values(1, 0)),

@@ -699,7 +699,7 @@ class SetupCovariance(FiniteNumbers):
 class Parameters:
     """Every parameter in force: what post-processing a recording needs."""
 
-    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu", "odometry"})
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu", "odometry", "no_poses"})
 
     type: Literal["parameters"] = "parameters"
     stations: tuple[StationParameters, ...]
@@ -716,3 +716,5 @@ class Parameters:
     """The robot's IMU; absent where none is configured."""
     odometry: OdometryParameters | None = None
     """The robot's wheel odometry, which is used with the IMU; absent where none is configured."""
+    no_poses: str | None = None
+    """Why no poses are computed: a set-up file is missing, so that frames or prisms are unknown here; else absent."""

@@ -36,13 +36,14 @@ from tsgt.simulation.mission.authors_node import AUTHORS_TIMESTAMP_DELAY_MS, Aut
 from tsgt.station import Condition, Reading
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Coroutine
+    from collections.abc import AsyncGenerator, Callable, Coroutine
     from pathlib import Path
     from typing import Any
 
     from harness.scene import Scene
 
     from tsgt.clock import Clock
+    from tsgt.model import Parameters
     from tsgt.radio import Direction, Packet, Radio, RadioOpener
     from tsgt.radio.superframe import BeaconReception
     from tsgt.recording.journal import InstrumentRecord
@@ -382,11 +383,13 @@ class Field:
         clock: Clock = TRUE,
         key: bytes | None = KEY,
         start_imu: StartProgram | None = None,
+        parameters: Parameters | None = None,
+        read_setup: Callable[[], Parameters] | None = None,
     ) -> None:
         """Run the master until cancelled; published records are appended to :attr:`records`."""
         await run_master(
             config or self.config(),
-            self.scene.parameters,
+            parameters or self.scene.parameters,
             PAPER,
             MasterDependencies(
                 open_radio=open_radio or self.open_radio(),
@@ -394,6 +397,7 @@ class Field:
                 key=key,
                 random_bits=lambda bits: int(self.rng.integers(1 << bits)),
                 start_imu=start_imu,
+                read_setup=read_setup,
                 disk_status=lambda _folder: self.disk,
                 observe=lambda record, _line: self.records.append(record),
             ),

@@ -42,10 +42,11 @@ def with_layout(parameters: Parameters, layout: PrismLayout, *, path: Path) -> P
     Raises ConfigError if a prism of the recording has no position in the file, or the layout determines no pose.
     """
     positions_m = layout.positions_m
-    missing = [p.prism for p in parameters.prisms if p.prism not in positions_m]
+    # A master without a calibration knows which prisms its stations track.
+    numbers = [p.prism for p in parameters.prisms] or sorted({s.prism for s in parameters.stations})
+    missing = [number for number in numbers if number not in positions_m]
     if missing:
         raise ConfigError(f"{path}: prisms.{missing[0]}: missing; the recording has this prism", path=path)
-    numbers = [p.prism for p in parameters.prisms]
     try:
         check_layout(
             [positions_m[number] for number in numbers], names=numbers, imu=parameters.imu is not None
@@ -54,11 +55,9 @@ def with_layout(parameters: Parameters, layout: PrismLayout, *, path: Path) -> P
         raise ConfigError(f"{path}: {error}", path=path, key="prisms") from error
     known = parameters.setup_covariance
     prisms = tuple(PrismPosition(prism=number, position_m=positions_m[number]) for number in numbers)
-    return dataclasses.replace(
-        parameters,
-        prisms=prisms,
-        setup_covariance=_covariance(parameters, known, layout.covariance, known),
-    )
+    parameters = dataclasses.replace(parameters, prisms=prisms)
+    covariance = _covariance(parameters, known, layout.covariance, known)
+    return dataclasses.replace(parameters, setup_covariance=covariance)
 
 
 def with_imu_mounting(parameters: Parameters, mounting: ImuMounting, *, path: Path) -> Parameters:

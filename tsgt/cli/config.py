@@ -26,7 +26,8 @@ from tsgt.config import (
     check_permissions,
     find_problems,
     json_schema,
-    parameters,
+    missing_setup_files,
+    parameters_in_force,
     scenario_parameters,
 )
 from tsgt.errors import ConfigError, GeometryError
@@ -110,10 +111,13 @@ def problems_at_start(file: Path, content: Model, *, key_owner: int | None = Non
     match content:
         case MasterConfig():
             before = len(problems)
+            missing = missing_setup_files(content)
             for path in (content.setup.station_frames, content.setup.prism_layout):
+                if path in missing:
+                    continue
                 problems += find_problems(path)[1]
                 attempt(check_permissions, path)
-            if len(problems) == before:
+            if len(problems) == before and not missing:
                 attempt(_check_master, file, content)
         case ScenarioConfig():
             prisms = scenario_parameters(content).prisms
@@ -129,7 +133,7 @@ def problems_at_start(file: Path, content: Model, *, key_owner: int | None = Non
 
 def _check_master(file: Path, config: MasterConfig) -> None:
     try:
-        known = parameters(config)
+        known = parameters_in_force(config)
     except ConfigError as error:
         if error.path is None:
             raise ConfigError(f"{file}: {error}", path=file, key=error.key) from error
@@ -148,8 +152,10 @@ def _check_layout(path: Path, prisms: tuple[PrismPosition, ...], *, imu: bool) -
 def _summary(content: Model) -> dict[str, Any]:
     match content:
         case MasterConfig():
+            known = parameters_in_force(content)
             return {
-                **_numbers(parameters(content)),
+                **_numbers(known),
+                **({} if known.no_poses is None else {"no_poses": known.no_poses}),
                 **_protocol(content.protocol),
                 "socket": str(content.stream.socket),
                 "recordings": str(content.recording.directory),

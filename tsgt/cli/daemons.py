@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from typing import TYPE_CHECKING, NoReturn
 
 import click
@@ -11,6 +12,8 @@ from tsgt.cli.options import path_type
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tsgt.model import Parameters
 
 _config_option = click.option(
     "--config", "config_path", type=path_type, required=True, help="Configuration (TOML)."
@@ -52,28 +55,36 @@ def client(config_path: Path) -> None:
 def master(config_path: Path) -> None:
     """Collect the stations' measurements over the radio; stream and record poses.
 
-    Runs until SIGTERM or Ctrl-C. Failures of stations, radio and disk are retried meanwhile.
+    Runs until SIGTERM or Ctrl-C. Failures of stations, radio and disk are retried meanwhile. Before the first calibration,
+    when set-up files are missing, it streams and records raw measurements without poses. SIGUSR1 (`systemctl reload
+    tsgt-master`, or --apply of the calibrating commands) makes it read the set-up files again.
     """
     # Imported here: `--help` needs none of it.
     from tsgt import service
     from tsgt.cli.composition import radio_key, radio_opener
     from tsgt.clock import SystemClock
-    from tsgt.config import MasterConfig, check_permissions, load, parameters
+    from tsgt.config import MasterConfig, check_permissions, load, parameters_in_force
     from tsgt.master.daemon import MasterDependencies, run_master
+    from tsgt.master.reload import RELOAD_SIGNAL
     from tsgt.radio.from_config import lora_settings
     from tsgt.radio.legality import check_legality
 
+    signal.signal(RELOAD_SIGNAL, signal.SIG_IGN)  # one that comes early must not kill
     check_permissions(config_path)
     config = load(config_path, MasterConfig)
-    check_permissions(config.setup.station_frames)
-    check_permissions(config.setup.prism_layout)
-    in_force = parameters(config)
+
+    def read_setup() -> Parameters:
+        check_permissions(config.setup.station_frames)
+        check_permissions(config.setup.prism_layout)
+        return parameters_in_force(config)
+
+    in_force = read_setup()
     settings = lora_settings(config.radio, config_path)
     check_legality(config, config_path)
     key = radio_key(config.protocol)
     clock = SystemClock()
     open_radio = radio_opener(config.radio, settings, clock)
-    dependencies = MasterDependencies(open_radio=open_radio, clock=clock, key=key)
+    dependencies = MasterDependencies(open_radio=open_radio, clock=clock, key=key, read_setup=read_setup)
     service.run(lambda: run_master(config, in_force, settings, dependencies))
 
 

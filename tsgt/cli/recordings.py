@@ -20,6 +20,7 @@ from tsgt.cli.options import path_type, resolved_point
 from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
 from tsgt.config import load_imu_mounting, load_prism_layout, load_station_calibration
+from tsgt.errors import InputFileError
 from tsgt.model import OdometryParameters
 from tsgt.recording import (
     RecordingHeader,
@@ -162,7 +163,11 @@ def load(
 ) -> Recording:
     """Read a recording, without the samples of its IMU unless ``imu`` is given, and replace the parameters that are given."""
     own_samples = imu is not None and not imu.left_out and imu.samples is None
-    recording = load_recording(path, imu=own_samples, keep_going=keep_going, on_problem=report_problem)
+    recording = load_recording(
+        path, imu=own_samples, whole=frames is not None, keep_going=keep_going, on_problem=report_problem
+    )
+    if frames is None or prisms is None:
+        recording = calibrated(recording, path)
     if point is not None:
         point = resolved_point(point, recording.parameters)
     if imu is not None:
@@ -179,10 +184,26 @@ def load(
         parameters = with_calibration(parameters, load_station_calibration(frames), path=frames)
     if prisms is not None:
         parameters = with_layout(parameters, load_prism_layout(prisms), path=prisms)
+    parameters = dataclasses.replace(parameters, no_poses=None)
     if point is not None:
         parameters = dataclasses.replace(parameters, reference_point=point)
     recording = dataclasses.replace(recording, parameters=parameters)
     return recording if estimator is None else with_estimator(recording, estimator)
+
+
+def calibrated(recording: Recording, path: Path) -> Recording:
+    """Return the recording, with a note if a part is left out; raises InputFileError if it has no calibration."""
+    if recording.left_out:
+        click.echo(
+            f"note: {path}: {recording.left_out} measurements before the set-up was replaced are left out",
+            err=True,
+        )
+    if recording.parameters.no_poses is not None:
+        raise InputFileError(
+            f"{recording.parameters.no_poses}; `tsgt process` and `tsgt evaluate` take --frames and --prisms",
+            path=path,
+        )
+    return recording
 
 
 def load_reference(

@@ -47,6 +47,7 @@ class Hello:
     version: str
     capabilities: tuple[str, ...]
     limits: ValidityLimits | None = None
+    no_poses: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,6 +129,7 @@ class Setup:
     geofences: tuple[SetupGeofence, ...] = ()
     imu: bool
     recording: str | None = None
+    no_poses: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -335,6 +337,7 @@ class Status:
     odometry: OdometryStatus | None = None
     recording: RecordingStatus | None = None
     disk: DiskStatus | None = None
+    no_poses: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -47,7 +47,14 @@ from tsgt.config.master import (
     StreamConfig,
 )
 from tsgt.config.odometry import OdometryConfig
-from tsgt.config.parameters import level_frame, noise, parameters, scenario_parameters
+from tsgt.config.parameters import (
+    level_frame,
+    missing_setup_files,
+    noise,
+    parameters,
+    parameters_in_force,
+    scenario_parameters,
+)
 from tsgt.config.permissions import check_permissions
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import (
@@ -142,9 +149,11 @@ __all__ = [
     "load_imu_mounting",
     "load_prism_layout",
     "load_station_calibration",
+    "missing_setup_files",
     "noise",
     "normal_gravity_mps2",
     "parameters",
+    "parameters_in_force",
     "scenario_parameters",
     "setup_covariance",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
 
@@ -27,12 +28,14 @@ from tsgt.model import (
 )
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tsgt.config.base import NoiseConfig
-    from tsgt.config.master import MasterConfig
+    from tsgt.config.master import MasterConfig, StationConfig
     from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
     from tsgt.config.scenario import ScenarioConfig, SimulatedStation
     from tsgt.config.scenario_imu import SimulatedImu
-    from tsgt.model import ReferencePoint
+    from tsgt.model import ReferencePoint, SetupCovariance
 
 
 def parameters(config: MasterConfig) -> Parameters:
@@ -60,6 +63,63 @@ def parameters(config: MasterConfig) -> Parameters:
     tracked = sorted({station.prism for station in config.stations})
     if len(tracked) < MIN_PRISMS:
         _check_imu(config, len(tracked))
+    return _parameters(
+        config,
+        tuple(calibration.stations[each.station].applied(_station(each)) for each in config.stations),
+        tuple(PrismPosition(prism=prism, position_m=layout[prism]) for prism in tracked),
+        calibration.covariance,
+        prism_layout.covariance,
+    )
+
+
+def missing_setup_files(config: MasterConfig) -> list[Path]:
+    """Return the set-up files that do not exist: before the first calibration a master has none."""
+    missing = []
+    for path in (config.setup.station_frames, config.setup.prism_layout):
+        try:
+            path.stat()
+        except FileNotFoundError:
+            missing.append(path)
+        except OSError:  # its reader says which
+            continue
+    return missing
+
+
+def parameters_in_force(config: MasterConfig) -> Parameters:
+    """Return the parameters of a master: as :func:`parameters`; if a set-up file is missing, those without poses."""
+    missing = missing_setup_files(config)
+    if not missing:
+        return parameters(config)
+    commands = {
+        config.setup.station_frames: "tsgt calibrate targets",
+        config.setup.prism_layout: "tsgt calibrate prisms",
+    }
+    files = " and ".join(f"{path} (`{commands[path]}` writes it)" for path in missing)
+    stations = tuple(_station(each) for each in config.stations)
+    uncalibrated = _parameters(config, stations, (), None, None)
+    return dataclasses.replace(uncalibrated, no_poses=f"not calibrated: {files} does not exist")
+
+
+def _station(config: StationConfig) -> StationParameters:
+    """Return the parameters of a station without a calibration."""
+    return StationParameters(
+        station=config.station,
+        prism=config.prism,
+        prism_constant_m=config.prism_constant_mm / 1e3,
+        atmospheric_ppm=config.atmospheric_ppm,
+        latency_ns=round(config.latency_ms * 1e6),
+        noise=noise(config.noise),
+        noise_scale=config.noise_scale,
+    )
+
+
+def _parameters(
+    config: MasterConfig,
+    stations: tuple[StationParameters, ...],
+    prisms: tuple[PrismPosition, ...],
+    station_covariance: SetupCovariance | None,
+    prism_covariance: SetupCovariance | None,
+) -> Parameters:
     mounting = (
         None if config.imu is None or config.imu.mounting is None else load_imu_mounting(config.imu.mounting)
     )
@@ -67,28 +127,15 @@ def parameters(config: MasterConfig) -> Parameters:
     if imu is not None and mounting is not None:
         imu = mounting.applied(imu)
     return Parameters(
-        stations=tuple(
-            calibration.stations[station.station].applied(
-                StationParameters(
-                    station=station.station,
-                    prism=station.prism,
-                    prism_constant_m=station.prism_constant_mm / 1e3,
-                    atmospheric_ppm=station.atmospheric_ppm,
-                    latency_ns=round(station.latency_ms * 1e6),
-                    noise=noise(station.noise),
-                    noise_scale=station.noise_scale,
-                )
-            )
-            for station in config.stations
-        ),
-        prisms=tuple(PrismPosition(prism=prism, position_m=layout[prism]) for prism in tracked),
+        stations=stations,
+        prisms=prisms,
         pipeline=pipeline_parameters(config.pipeline),
         reference_point=_reference_point(config.reference_point, imu),
         setup_covariance=setup_covariance(
-            calibration.covariance,
-            prism_layout.covariance,
+            station_covariance,
+            prism_covariance,
             station_numbers=(station.station for station in config.stations),
-            prism_numbers=tracked,
+            prism_numbers=(prism.prism for prism in prisms),
             imu=None if mounting is None else mounting.covariance,
         ),
         imu=imu,

@@ -18,6 +18,7 @@ from tsgt.config import (
     check_permissions,
     load,
     load_any,
+    missing_setup_files,
     parameters,
 )
 from tsgt.doctor.computer import EARLIEST, is_installed, may_write
@@ -107,10 +108,16 @@ def check_setup(machine: Machine, config: MasterConfig) -> list[Finding]:
         problem = error
     files = {"station_frames": config.setup.station_frames, "prism_layout": config.setup.prism_layout}
     found = []
+    if missing := missing_setup_files(config):
+        problem = None
     if problem is not None and problem.path not in files.values():
         found.append(failed("stations", str(problem)))
     for name, path in files.items():
-        if problem is not None and problem.path == path:
+        if path in missing:
+            command = "targets" if name == "station_frames" else "prisms"
+            text = f"{path} does not exist: the master runs without poses until `tsgt calibrate {command} ... --apply` writes it"
+            found.append(note(name, text))
+        elif problem is not None and problem.path == path:
             found.append(failed(name, str(problem)))
         else:
             found.append(_check_setup_file(machine, name, path))

@@ -25,18 +25,23 @@ if TYPE_CHECKING:
 class LiveEstimator:
     """Turns arriving measurements into records: each measurement, followed by the poses that it completes.
 
+    With parameters that allow no poses (``no_poses``) there are none, and no deadlines.
+
     ``start_check``: how a check of the IMU's set-up is computed.
     """
 
     def __init__(self, parameters: Parameters, start_check: StartCheck = start_now) -> None:
         continuous = parameters.pipeline.estimator == "continuous"
-        self._with_imu = continuous and parameters.imu is not None
+        calibrated = parameters.no_poses is None
+        self._with_imu = continuous and calibrated and parameters.imu is not None
         self._setup = None
-        if parameters.imu is not None:
+        if calibrated and parameters.imu is not None:
             self._setup = ImuSetupMonitor(parameters, start_check)
-        self._estimator = (
-            ContinuousEstimator(parameters, self._setup) if continuous else LinearEstimator(parameters)
-        )
+        self._estimator: ContinuousEstimator | LinearEstimator | None = None
+        if calibrated:
+            self._estimator = (
+                ContinuousEstimator(parameters, self._setup) if continuous else LinearEstimator(parameters)
+            )
         self._now_ns = -(2**63)
         self._begun = False
 
@@ -48,6 +53,9 @@ class LiveEstimator:
         """
         if measurement.received_ns < self._now_ns:
             measurement = dataclasses.replace(measurement, received_ns=self._now_ns)
+        if self._estimator is None:
+            self.advance(measurement.received_ns)
+            return [measurement]
         if not self._begun:
             self._estimator.begin_at(measurement.received_ns)
             self._begun = True
@@ -88,7 +96,7 @@ class LiveEstimator:
     def advance(self, now_ns: int) -> list[PoseRecord]:
         """Return the poses that are due by now; call it before another record is published."""
         self._now_ns = max(self._now_ns, now_ns)
-        return list(self._estimator.advance(self._now_ns).records())
+        return [] if self._estimator is None else list(self._estimator.advance(self._now_ns).records())
 
     def imu_setup_events(self) -> Sequence[EventRecord]:
         """Return the events on the set-up of the IMU since the last call; a replay finds them in its recording."""
@@ -106,4 +114,4 @@ class LiveEstimator:
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`advance` has to be called if nothing arrives before; None while nothing is due."""
-        return self._estimator.next_deadline_ns()
+        return None if self._estimator is None else self._estimator.next_deadline_ns()

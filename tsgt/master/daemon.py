@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
@@ -29,6 +29,7 @@ from tsgt.master.observers import GeofenceObserver, layout_monitor
 from tsgt.master.publisher import Publisher
 from tsgt.master.reacquisition_hints import ReacquisitionHints
 from tsgt.master.recording_thread import RecordingDisk, RecordingThread, disk_status
+from tsgt.master.reload import reloading
 from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
@@ -42,7 +43,6 @@ from tsgt.recording import (
     RecordingWriter,
     SetupGeofence,
     SetupRecord,
-    ValidityLimits,
     encode_line,
     new_recording_path,
     read_target_checks,
@@ -86,6 +86,8 @@ class MasterDependencies:
     """Starts the program that reads the IMU; None: as a child process."""
     start_odometry: StartProgram | None = None
     """Starts the program that reads the wheel odometry, likewise."""
+    read_setup: Callable[[], Parameters] | None = None
+    """Reads the set-up files again, at the signal of :mod:`tsgt.master.reload`; raises ConfigError. None: the signal is not handled."""
     write: Callable[[int, memoryview], int] | None = None  # see :class:`~tsgt.recording.RecordingWriter`
     disk_status: Callable[[Path], DiskStatus | None] = disk_status
     """Returns the space on the disk of a folder; called in a thread."""
@@ -110,7 +112,7 @@ async def run_master(
     path = new_recording_path(config.recording.directory, "master", start_ns)
     server = StreamServer(
         config.stream.socket,
-        encode_line(HelloRecord(limits=ValidityLimits.of(parameters))),
+        encode_line(HelloRecord.of(parameters)),
         mode=int(config.stream.mode, 8),
         queue_lines=config.stream.queue_lines,
         unix_now_ns=unix_now_ns,
@@ -118,6 +120,7 @@ async def run_master(
     with (
         ThreadPoolExecutor(1, "imu_setup_check") as checks,
         RecordingWriter(path, write=dependencies.write) as writer,
+        ExitStack() as stack,
     ):
         recorder = Recorder(writer)
         recording = RecordingThread(recorder, unix_now_ns)
@@ -142,22 +145,35 @@ async def run_master(
         try:
             async with server, asyncio.TaskGroup() as group:
                 stations = [station.station for station in config.stations]
+                observers = [
+                    ImuUseMonitor(),
+                    OdometryUseMonitor(),
+                    *(GeofenceObserver(geofence, group) for geofence in config.geofences),
+                ]
                 publisher = Publisher(
                     parameters,
                     Statistics(stations, read_target_checks(config.recording.directory)),
                     StationEventDetector(stations, start_ns),
-                    [
-                        layout_monitor(config.frame_watch, parameters),
-                        ImuUseMonitor(),
-                        OdometryUseMonitor(),
-                        *(GeofenceObserver(geofence, group) for geofence in config.geofences),
-                    ],
+                    [layout_monitor(config.frame_watch, parameters), *observers],
                     emit,
                     unix_now_ns,
                     dependencies.start_check or (lambda work: checks.submit(work).result),
                 )
                 publisher.put(_setup_record(config, parameters, start_ns, path.name, dependencies.key))
-                link = _link(config, parameters, settings, timeline, recording, publisher, dependencies)
+                if parameters.no_poses is not None:
+                    publisher.report(MasterEvent("setup_missing", f"no poses: {parameters.no_poses}"))
+                hints = ReacquisitionHints(parameters)
+                link = _link(config, hints, settings, timeline, recording, publisher, dependencies)
+
+                def set_up(found: Parameters) -> None:
+                    publisher.set_up(
+                        found, [layout_monitor(config.frame_watch, found), *observers], recording.put
+                    )
+                    hints.set_up(found)
+                    server.greet_with(encode_line(HelloRecord.of(found)))
+                    publisher.put(_setup_record(config, found, unix_now_ns(), path.name, dependencies.key))
+
+                stack.enter_context(reloading(dependencies.read_setup, set_up, publisher.report))
                 imu = _imu(config, timeline, publisher, dependencies)
                 disk = RecordingDisk(recording, path, start_ns, dependencies.disk_status)
                 odometry = _odometry(config, timeline, publisher, dependencies)
@@ -226,7 +242,7 @@ class Link(Protocol):
 
 def _link(
     config: MasterConfig,
-    parameters: Parameters,
+    hints: ReacquisitionHints,
     settings: LoRaSettings,
     timeline: UnixTimeline,
     recording: RecordingThread,
@@ -244,7 +260,7 @@ def _link(
         timeline,
         publisher.report,
         recording,
-        ReacquisitionHints(parameters),
+        hints,
         key=dependencies.key,
         random_bits=dependencies.random_bits,
     )

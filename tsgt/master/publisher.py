@@ -83,13 +83,28 @@ class Publisher:
         now_ns: Callable[[], int],
         start_check: StartCheck = start_now,
     ) -> None:
+        self._start_check = start_check
         self._estimator = LiveEstimator(parameters, start_check)
         self._statistics = statistics
+        self._no_poses = parameters.no_poses
         self._detector = detector
         self._observers = observers
         self._emit = emit
         self._now_ns = now_ns
         self._changed = asyncio.Event()
+
+    def set_up(
+        self, parameters: Parameters, observers: Sequence[Observer], record: Callable[[bytes], None]
+    ) -> None:
+        """Publish the poses that are due by now, and begin anew with other parameters; ``record`` takes their line.
+
+        The set-up record has to follow, as in a replay.
+        """
+        self.advance(self._now_ns())
+        record(encode_line(parameters))
+        self._estimator = LiveEstimator(parameters, self._start_check)
+        self._no_poses = parameters.no_poses
+        self._observers = observers
 
     def report(self, event: link_events.LinkEvent) -> None:
         """Count and publish what a link reports, with the events that follow from it."""
@@ -150,6 +165,7 @@ class Publisher:
         if odometry is not None and state is not None and state.odometry is not None:
             odometry = _with_estimate(odometry, state.odometry)
         status = self._statistics.status(now_ns, link, imu, recording, disk, odometry=odometry)
+        status = replace(status, no_poses=self._no_poses)
         self.put(status)
         for observer in self._observers:
             self._put_all(observer.status(status))

@@ -75,10 +75,14 @@ class ReacquisitionHints:
     """Decides when a station gets a search direction, and which one."""
 
     def __init__(self, parameters: Parameters) -> None:
+        self._stations = {station.station: _Station(station.prism) for station in parameters.stations}
+        self.set_up(parameters)
+
+    def set_up(self, parameters: Parameters) -> None:
+        """Use other frames and another layout, for the same stations."""
         self._parameters = parameters
         self._frames = {station.station: station for station in parameters.stations}
         self._layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
-        self._stations = {station.station: _Station(station.prism) for station in parameters.stations}
 
     def measured(self, measurement: PolarMeasurement) -> None:
         """Take a measurement; those of a station arrive in any order."""
@@ -105,6 +109,8 @@ class ReacquisitionHints:
         """Return where to search, the same object for 5 s (another is a new command); None: no hint. Master's Unix clock."""
         station = self._stations[number]
         if station.lost_ns is None or now_ns - station.lost_ns <= HINT_DELAY_NS:
+            return None
+        if self._parameters.no_poses is not None:
             return None
         if station.hint_ns is not None:
             since_ns = now_ns - station.hint_ns

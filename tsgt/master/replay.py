@@ -22,7 +22,6 @@ from tsgt.recording import (
     HelloRecord,
     SetupRecord,
     StatusRecord,
-    ValidityLimits,
     decode_line,
     encode_line,
     read_lines,
@@ -116,7 +115,7 @@ def greeting(path: Path, *, keep_going: bool = False) -> HelloRecord:
     """Return the greeting of a replay: with the limits of the recording's first session. Raises as :func:`replayed`."""
     for line in read_lines(path, keep_going=keep_going):
         if line.type == "parameters":
-            return HelloRecord(limits=ValidityLimits.of(decode_line(Parameters, line, path)))
+            return HelloRecord.of(decode_line(Parameters, line, path))
     return HelloRecord()
 
 

@@ -104,6 +104,10 @@ class StreamServer:
                 reader.abort()
         await self._until(lambda: not self._readers)
 
+    def greet_with(self, hello: bytes) -> None:
+        """Greet further readers with another line, without line end."""
+        self._greeting = hello + b"\n"
+
     @property
     def readers(self) -> int:
         """Number of connected readers."""

@@ -53,6 +53,8 @@ class Recording:
         default_factory=list
     )  # in the order of arrival; empty unless they were read
     odometry: list[OdometrySamples] = field(default_factory=list)  # likewise
+    left_out: int = 0
+    """Measurements before the set-up was replaced while the master ran: the last parameters need not apply to them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +118,14 @@ def load_recording(
     path: Path,
     *,
     imu: bool = False,
+    whole: bool = False,
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Recording:
     """Read measurements and parameters for post-processing.
 
-    ``imu``: also read the samples of the robot's IMU and wheel odometry. ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
+    Where the set-up was replaced while the master ran, what precedes the last set-up is left out: the tripods may have
+    stood elsewhere. ``whole``: include it. ``imu``: also read the samples of the robot's IMU and wheel odometry. ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
     cannot be read. Raises RecordingError as :func:`read_lines`, and without parameters in the file.
     """
     header: RecordingHeader | None = None
@@ -130,14 +134,24 @@ def load_recording(
     imu_samples: list[ImuSamples] = []
     odometry: list[OdometrySamples] = []
     end_ns: int | None = None
+    left_out = 0
+    replaced = new_session = False
+    valid_from_ns = -(2**63)  # measurements before the last set-up arrive late or were merged
     for line in read_lines(path, imu=imu, keep_going=keep_going, on_problem=on_problem):
         known_ns: int | None = None
         try:
             match line.type:
                 case "recording":
                     header = header or decode_line(RecordingHeader, line, path)
+                    new_session = True
                 case "parameters":
                     parameters = decode_line(Parameters, line, path)
+                    replaced = not new_session and not whole
+                    if replaced:
+                        left_out += len(measurements)
+                        for samples in (measurements, imu_samples, odometry):
+                            samples.clear()
+                    new_session = False
                 case "measurement" | "point":
                     measurement: Measurement = decode_line(_MEASUREMENTS[line.type], line, path)
                     measurements.append(measurement)
@@ -145,6 +159,8 @@ def load_recording(
                 case "merged":
                     measurements.append(decode_line(MergedRecord, line, path).measurement)
                     known_ns = measurements[-1].received_ns
+                case "setup" if replaced:
+                    valid_from_ns, replaced = decode_line(_Stamped, line, path).stamp_ns, False
                 case "imu":
                     imu_samples.append(decode_line(ImuSamples, line, path))
                 case "odometry" if imu:
@@ -158,6 +174,9 @@ def load_recording(
                 on_problem(problem)
         if known_ns is not None:
             end_ns = known_ns if end_ns is None else max(end_ns, known_ns)
+    early = [each for each in measurements if each.stamp_ns < valid_from_ns]
+    if early:
+        measurements = [each for each in measurements if each.stamp_ns >= valid_from_ns]
     if header is None or parameters is None:  # read_lines has checked the header
         raise RecordingError("contains no parameters; the program that wrote it ended too early", path=path)
     return Recording(
@@ -167,6 +186,7 @@ def load_recording(
         end_ns=end_ns,
         imu_samples=imu_samples,
         odometry=odometry,
+        left_out=left_out + len(early),
     )
 
 

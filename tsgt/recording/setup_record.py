@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -95,6 +95,8 @@ class SetupGeofence(FiniteNumbers):
 class SetupRecord(FiniteNumbers):
     """The set-up in force: to each reader after ``hello``, and to all whenever it changes."""
 
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"no_poses"})
+
     type: Literal["setup"] = "setup"
     stamp_ns: int
     """Since when it has been in force, on the master's Unix clock in ns."""
@@ -128,6 +130,8 @@ class SetupRecord(FiniteNumbers):
     """Whether the robot has an IMU that poses may rest on."""
     recording: str | None = None
     """File name of the recording, in the folder that the master's configuration names; null without one."""
+    no_poses: str | None = None
+    """Why no poses are computed with it: the master is not calibrated, and stations and prisms are empty. Else absent."""
 
     def __post_init__(self) -> None:
         """Reject times outside 64 bits."""
@@ -161,7 +165,9 @@ class SetupRecord(FiniteNumbers):
             if continuous
             else (),
             limits=ValidityLimits.of(parameters),
-            stations=tuple(_station(each, parameters.setup_covariance) for each in parameters.stations),
+            stations=()
+            if parameters.no_poses is not None
+            else tuple(_station(each, parameters.setup_covariance) for each in parameters.stations),
             prisms=tuple(
                 SetupPrism(id=each.prism, station=trackers.get(each.prism), position_m=each.position_m)
                 for each in parameters.prisms
@@ -169,6 +175,7 @@ class SetupRecord(FiniteNumbers):
             geofences=tuple(geofences),
             imu=parameters.imu is not None,
             recording=recording,
+            no_poses=parameters.no_poses,
         )
 
 

@@ -113,6 +113,8 @@ LimitsOrNone = ValidityLimits | None
 class HelloRecord:
     """The first line that a reader gets."""
 
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"no_poses"})
+
     type: Literal["hello"] = "hello"
     protocol: int = PROTOCOL_VERSION
     """Version of the stream's format. It changes when a reader of the old version would misread the new one; new types
@@ -123,6 +125,15 @@ class HelloRecord:
     """Types of lines that may follow."""
     limits: LimitsOrNone = None
     """What ``valid`` promises of a pose, with the limits in force; null where no poses follow."""
+    no_poses: str | None = None
+    """Why no poses follow until the set-up changes (``setup``): the master is not calibrated. Else absent."""
+
+    @classmethod
+    def of(cls, parameters: Parameters) -> HelloRecord:
+        """Return the greeting of a master with these parameters."""
+        if parameters.no_poses is not None:
+            return cls(no_poses=parameters.no_poses)
+        return cls(limits=ValidityLimits.of(parameters))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -440,7 +451,7 @@ DiskStatusOrNone = DiskStatus | None
 class StatusRecord(FiniteNumbers):
     """The status of the master and its stations, about once per second."""
 
-    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu", "odometry"})
+    omitted_if_none: ClassVar[frozenset[str]] = frozenset({"imu", "odometry", "no_poses"})
 
     type: Literal["status"] = "status"
     stamp_ns: int
@@ -465,6 +476,8 @@ class StatusRecord(FiniteNumbers):
     """Status of the recording; null in recordings of older versions."""
     disk: DiskStatusOrNone = None
     """Space on its disk; null where unknown."""
+    no_poses: str | None = None
+    """Why no poses are computed: the master is not calibrated. Else absent."""
 
     def __post_init__(self) -> None:
         """Reject times outside 64 bits."""

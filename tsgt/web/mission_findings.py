@@ -38,13 +38,14 @@ ALARMS = frozenset(
     {
         "station_lost", "battery_low", "radio_failed", "geofence_exited", "layout_residual_high", "imu_setup_wrong", "imu_lost",
         "beacon_time_rejected", "link_delay_anomaly", "unauthenticated", "station_contradicted", "disk_full", "disk_failed",
+        "setup_missing", "setup_rejected",
     }
 )  # fmt: skip
 """Events that need the operator."""
 
 _END = {
     "radio_failed": {"radio_recovered"},
-    "layout_residual_high": {"layout_residual_normal"},
+    "layout_residual_high": {"layout_residual_normal", "setup_applied"},
     "imu_setup_wrong": {"imu_setup_confirmed"},
     "disk_full": {"disk_low", "disk_failed", "disk_recovered"},
     "disk_failed": {"disk_low", "disk_full", "disk_recovered"},
@@ -57,6 +58,7 @@ _GOOD_NEWS = frozenset(
     {
         "station_recovered", "battery_recovered", "station_measuring", "station_tracking", "radio_recovered", "imu_setup_confirmed",
         "disk_recovered", "imu_recovered", "imu_plausible", "imu_used", "odometry_recovered", "odometry_agrees", "geofence_entered", "layout_residual_normal",
+        "setup_applied",
     }
 )  # fmt: skip
 

@@ -311,7 +311,8 @@ class MissionState:
             *findings.imu_findings(self._status),
             *findings.odometry_findings(self._status),
         ]
-        waiting_for = radio_failure or findings.waiting_for(conditions)
+        uncalibrated = None if self._status is None else self._status.no_poses
+        waiting_for = uncalibrated or radio_failure or findings.waiting_for(conditions)
         return judge(stream, facts, waiting_for, others)
 
     def _conditions(self, now_s: float) -> dict[int, stations.Condition]:

@@ -17,6 +17,7 @@ from tsgt.config import (
     load,
     noise,
     parameters,
+    parameters_in_force,
     scenario_parameters,
 )
 from tsgt.config.parameters import pipeline_parameters
@@ -201,3 +202,26 @@ def test_scenario_frames_are_level_and_rigid() -> None:
         check_transform(T)
         assert T[2, 2] == 1.0
     assert scenario_parameters(ScenarioConfig()).stations[0].T_station1_station[0] == (1.0, 0.0, 0.0, 0.0)
+
+
+def test_missing_set_up_files_give_parameters_without_poses(folder: Path) -> None:
+    """The reason names each missing file with its command; stations keep what the configuration says."""
+    config = load(folder / "master.example.toml", MasterConfig)
+    known = parameters(config)
+    assert parameters_in_force(config) == known
+    config.setup.station_frames.unlink()
+    found = parameters_in_force(config)
+    assert found.no_poses == (
+        f"not calibrated: {config.setup.station_frames} (`tsgt calibrate targets` writes it) does not exist"
+    )
+    assert found.prisms == ()
+    assert found.stations[0] == known.stations[0]  # the frame of the world
+    assert [each.station for each in found.stations] == [1, 2, 3]
+
+
+def test_broken_set_up_file_is_an_error(folder: Path) -> None:
+    """Only a missing one is taken for the time before the first calibration."""
+    config = load(folder / "master.example.toml", MasterConfig)
+    config.setup.station_frames.write_text("nonsense")
+    with pytest.raises(ConfigError, match="not TOML"):
+        parameters_in_force(config)

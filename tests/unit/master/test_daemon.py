@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
@@ -19,10 +21,11 @@ from harness.radios import PAPER
 from harness.scene import START, driving, stationary_scene
 
 from tsgt.config import AlarmsConfig, GeofenceConfig, ImuConfig
-from tsgt.errors import RadioError
+from tsgt.errors import ConfigError, RadioError
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.geofence import run_geofence_command
-from tsgt.master.replay import replayed
+from tsgt.master.reload import RELOAD_SIGNAL
+from tsgt.master.replay import greeting, replayed
 from tsgt.model import ImuSamples, PolarMeasurement, Status
 from tsgt.recording import (
     ClockRecord,
@@ -32,6 +35,7 @@ from tsgt.recording import (
     SetupRecord,
     StatusRecord,
     encode_line,
+    load_recording,
     read_imu_samples,
     read_lines,
     write_target_checks,
@@ -45,6 +49,7 @@ if TYPE_CHECKING:
 
     from harness.field import Field
 
+    from tsgt.model import Parameters
     from tsgt.radio import Radio, Transmission
 
 DRIVING = stationary_scene().moving(driving)
@@ -219,6 +224,57 @@ async def test_recording_equals_stream_and_replay(tmp_path: Path, protocol: dict
     assert [line.data for line in lines[2:]] == streamed
     assert [line for _, some in replayed(field.recording()) for line in some] == streamed
     assert {"geofence_exited", "geofence_entered", "station_lost 3"} <= set(events(field))
+
+
+UNCALIBRATED = replace(DRIVING.parameters, prisms=(), no_poses="not calibrated")
+
+
+async def test_uncalibrated_master_takes_a_calibration_while_it_runs(tmp_path: Path) -> None:
+    """Until then it records raw measurements, and says why there are no poses; a replay gives the same lines."""
+    async with (
+        field_of(tmp_path, DRIVING) as field,
+        running(field.master(parameters=UNCALIBRATED, read_setup=lambda: DRIVING.parameters)),
+    ):
+        await asyncio.sleep(15)
+        assert events(field) == ["setup_missing"]
+        assert {m.station for m in field.of(PolarMeasurement)} == set(STATIONS)
+        assert field.of(PoseRecord) == []
+        assert field.of(StatusRecord)[-1].no_poses == "not calibrated"
+        assert field.of(SetupRecord)[-1].stations == ()
+        os.kill(os.getpid(), RELOAD_SIGNAL)
+        await asyncio.sleep(10)
+    assert events(field) == ["setup_missing", "setup_applied"]
+    assert field.of(PoseRecord)[-1].valid
+    assert field.of(StatusRecord)[-1].no_poses is None
+    assert [each.id for each in field.of(SetupRecord)[-1].stations] == list(STATIONS)
+    streamed = [encode_line(record) for record in field.records]
+    assert [line for _, some in replayed(field.recording()) for line in some] == streamed
+    assert greeting(field.recording()).no_poses == "not calibrated"
+    loaded = load_recording(field.recording())
+    applied_ns = field.of(SetupRecord)[-1].stamp_ns
+    assert loaded.parameters == DRIVING.parameters
+    assert min(each.stamp_ns for each in loaded.measurements) >= applied_ns
+    assert loaded.left_out == sum(m.stamp_ns < applied_ns for m in field.of(PolarMeasurement))
+    whole = load_recording(field.recording(), whole=True)
+    assert len(whole.measurements) == loaded.left_out + len(loaded.measurements)
+
+
+@pytest.mark.parametrize("found", [ConfigError("frames.toml: not TOML"), UNCALIBRATED])
+async def test_unusable_set_up_leaves_the_old_one(tmp_path: Path, found: ConfigError | Parameters) -> None:
+    """A broken or missing file is an event, and poses go on."""
+
+    def read_setup() -> Parameters:
+        if isinstance(found, ConfigError):
+            raise found
+        return found
+
+    async with field_of(tmp_path, DRIVING) as field, running(field.master(read_setup=read_setup)):
+        await asyncio.sleep(10)
+        os.kill(os.getpid(), RELOAD_SIGNAL)
+        await asyncio.sleep(5)
+    assert events(field) == ["setup_rejected"]
+    assert len(field.of(SetupRecord)) == 1
+    assert field.of(PoseRecord)[-1].valid
 
 
 class ImuProgram:

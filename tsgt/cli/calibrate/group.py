@@ -10,6 +10,7 @@ import numpy as np
 
 from tsgt.analysis.calibration import layout_covariance, solve_prisms
 from tsgt.analysis.formats import read_prism_file, write_prism_layout
+from tsgt.cli.calibrate.apply import apply_option, apply_setup, output_of
 from tsgt.cli.calibrate.check import check
 from tsgt.cli.calibrate.collect import collect
 from tsgt.cli.calibrate.frame_output import (
@@ -59,6 +60,7 @@ calibrate.add_command(targets)
     "Constant added to the distances of prisms, required if a line of FILE has no constant_mm.",
 )
 @output_option
+@apply_option
 @json_option
 def prisms(
     *,
@@ -66,6 +68,7 @@ def prisms(
     target_constant_mm: float | None,
     prism_constant_mm: float | None,
     output: Path | None,
+    master: Path | None,
     as_json: bool,
 ) -> int:
     """Solve the prism layout from measurements of one station.
@@ -74,6 +77,7 @@ def prisms(
     Exit code 3: the body points are inconsistent and the bad one cannot be identified (nothing is written), or the
     robot frame is weakly determined.
     """
+    output = output_of(output, master, "prism_layout")
     refuse_overwrite([file], output)
     measured = read_prism_file(file)
     bodies, sights = (
@@ -118,6 +122,8 @@ def prisms(
             covariance=layout_covariance(solved),
         )
         click.echo(f"{output}: {len(positions)} prisms with their joint covariance written", err=True)
+        if master is not None:
+            click.echo(apply_setup(master), err=True)
     elif output is not None:
         click.echo(f"{output} is not written: the body points are inconsistent", err=True)
     return CHECK_FAILED if failed else 0

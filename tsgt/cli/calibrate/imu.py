@@ -20,6 +20,7 @@ from tsgt.cli.options import (
 )
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
 from tsgt.cli.progress import progress
+from tsgt.cli.recordings import calibrated
 from tsgt.config import IMU_NOISE
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial_calibration import setup_components
@@ -74,6 +75,7 @@ def imu(
     """
     refuse_overwrite([recording, samples], output)
     loaded = load_recording(recording, keep_going=keep_going, on_problem=report_problem)
+    loaded = calibrated(loaded, recording)
     if noise is not None or gravity_mps2 is not None:
         if noise is None or gravity_mps2 is None:
             raise click.UsageError("--noise and --gravity-mps2 belong together")

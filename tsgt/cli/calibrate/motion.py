@@ -14,6 +14,7 @@ from tsgt.analysis.formats import InstrumentErrors, write_prism_layout, write_st
 from tsgt.cli.model_options import add_options
 from tsgt.cli.options import FiniteRange, OutputFile, json_option, keep_going_option, recording_argument
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
+from tsgt.cli.recordings import calibrated
 from tsgt.geometry.motion_calibration import SetupPrior, unobservable_directions
 from tsgt.model import SetupCovariance
 from tsgt.recording import load_recording
@@ -102,7 +103,7 @@ def motion(
         raise click.UsageError("--prism-output needs --estimate-prisms; without it the layout is fixed")
     known = frames == "known"
     found = calibrate_recording(
-        load_recording(recording, keep_going=keep_going, on_problem=report_problem),
+        calibrated(load_recording(recording, keep_going=keep_going, on_problem=report_problem), recording),
         SetupPrior(
             translation_sigma_m=frame_sigma_mm / 1e3 if known else UNKNOWN_SHIFT_M,
             rotation_sigma_rad=frame_sigma_mrad / 1e3 if known else UNKNOWN_TURN_RAD,

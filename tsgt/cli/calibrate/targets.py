@@ -17,6 +17,7 @@ from tsgt.analysis.calibration import (
     unidentified_text,
 )
 from tsgt.analysis.formats import read_target_file, write_station_frames
+from tsgt.cli.calibrate.apply import apply_option, apply_setup, output_of
 from tsgt.cli.calibrate.frame_output import (
     TARGET_CONSTANT,
     file_argument,
@@ -86,6 +87,7 @@ class _Exclusions(click.ParamType[tuple["Exclusion", ...]]):
     help="Leave out targets, the worst first, until no residual is larger, and accept the rest.",
 )
 @output_option
+@apply_option
 @json_option
 def targets(
     *,
@@ -96,6 +98,7 @@ def targets(
     exclude: tuple[Exclusion, ...] | None,
     max_residual_mm: float | None,
     output: Path | None,
+    master: Path | None,
     as_json: bool,
 ) -> int:
     """Solve station frames from common targets.
@@ -104,6 +107,7 @@ def targets(
     instruments that the targets show. Exit code 3: a check failed. Inconsistent targets are not written; the message
     says which option leaves them out.
     """
+    output = output_of(output, master, "station_frames")
     refuse_overwrite([file], output)
     measured = read_target_file(file)
     sights = (sight for seen in measured.measurements.values() for each in seen.values() for sight in each)
@@ -133,6 +137,8 @@ def targets(
         click.echo(written)
     for sentence in notes:
         click.echo(f"note: {sentence}", err=True)
+    if master is not None and solved.consistent:
+        click.echo(apply_setup(master), err=True)
     for sentence in failures:
         click.echo(f"check failed: {sentence}", err=True)
     return CHECK_FAILED if failures else 0

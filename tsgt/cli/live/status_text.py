@@ -65,6 +65,8 @@ def master_text(record: StatusRecord) -> tuple[list[str], bool]:
     ]
     if record.frame_ms is not None:
         head.append(f"frame {record.frame_ms:.0f} ms")
+    if record.no_poses is not None:
+        head += [_headline("NOT CALIBRATED: no poses", ok=False), *wrapped(printable(record.no_poses), "  ")]
     if record.protocol == "superframe" and not record.authenticated:
         head.append(_headline(NO_KEY, ok=False))
     blocks, problems = master_blocks(record)

@@ -1,0 +1,90 @@
+"""The option ``--apply``: write a set-up file where the master reads it, and have the running master use it."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import struct
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from tsgt.cli.options import path_type
+from tsgt.config import MasterConfig, load, missing_setup_files
+from tsgt.errors import TsgtError
+from tsgt.master.reload import RELOAD_SIGNAL
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RESPONSE_TIMEOUT_S = 20.0
+"""A master on a busy machine reads its files within a second."""
+
+SetupFile = Literal["station_frames", "prism_layout"]
+
+apply_option = click.option(
+    "--apply",
+    "master",
+    type=path_type,
+    metavar="MASTER.TOML",
+    help="Configuration of the master: write the set-up file that it names, and have the running master use it.",
+)
+
+
+def output_of(output: Path | None, master: Path | None, file: SetupFile) -> Path | None:
+    """Return the file to write: the one that is given, or the one that the configuration of the master names."""
+    if master is None:
+        return output
+    if output is not None:
+        raise click.UsageError(
+            "--output and --apply exclude each other: --apply writes the file of the master"
+        )
+    return getattr(load(master, MasterConfig).setup, file)  # type: ignore[no-any-return]
+
+
+def apply_setup(master: Path) -> str:
+    """Have the running master read its set-up files; return in a sentence what it has done.
+
+    Raises TsgtError if the master rejects them, cannot be reached by this user, or does not respond.
+    """
+    config = load(master, MasterConfig)
+    if missing := missing_setup_files(config):
+        return f"no poses yet: {', '.join(map(str, missing))} does not exist"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stream:
+        try:
+            stream.connect(str(config.stream.socket))
+        except OSError as error:
+            if isinstance(error, PermissionError):
+                raise TsgtError(f"{config.stream.socket}: {error.strerror}; try sudo") from error
+            return "the master is not running; it uses the file from its next start on"
+        size = struct.calcsize("3i")
+        pid, _, _ = struct.unpack("3i", stream.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
+        try:
+            os.kill(pid, RELOAD_SIGNAL)
+        except PermissionError as error:
+            raise TsgtError(
+                "this user may not signal the master: sudo systemctl reload tsgt-master"
+            ) from error
+        event, message = _response(stream)
+    if event != "setup_applied":
+        raise TsgtError(f"the master has rejected the set-up: {message}")
+    return f"the running master uses it: {message}"
+
+
+def _response(stream: socket.socket) -> tuple[str, str]:
+    """Return the event that says what the master has done, and its message."""
+    deadline_s = time.monotonic() + RESPONSE_TIMEOUT_S
+    with stream.makefile("rb") as lines, suppress(TimeoutError):
+        while (left_s := deadline_s - time.monotonic()) > 0:
+            stream.settimeout(left_s)
+            line = lines.readline()
+            if not line:
+                raise TsgtError("the master has ended")
+            if line.startswith(b'{"type":"event"'):
+                record = json.loads(line)
+                if record["event"] in {"setup_applied", "setup_rejected"}:
+                    return record["event"], record["message"]
+    raise TsgtError(f"the master has not responded within {RESPONSE_TIMEOUT_S:g} s")

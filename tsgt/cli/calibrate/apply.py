@@ -62,29 +62,34 @@ def apply_setup(master: Path) -> str:
             return "the master is not running; it uses the file from its next start on"
         size = struct.calcsize("3i")
         pid, _, _ = struct.unpack("3i", stream.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
-        try:
-            os.kill(pid, RELOAD_SIGNAL)
-        except PermissionError as error:
-            raise TsgtError(
-                "this user may not signal the master: sudo systemctl reload tsgt-master"
-            ) from error
-        event, message = _response(stream)
+        event, message = _response(stream, pid)
     if event != "setup_applied":
         raise TsgtError(f"the master has rejected the set-up: {message}")
     return f"the running master uses it: {message}"
 
 
-def _response(stream: socket.socket) -> tuple[str, str]:
-    """Return the event that says what the master has done, and its message."""
+def _response(stream: socket.socket, pid: int) -> tuple[str, str]:
+    """Signal the master; return the event that says what it has done, and its message."""
     deadline_s = time.monotonic() + RESPONSE_TIMEOUT_S
+    greeted = False
     with stream.makefile("rb") as lines, suppress(TimeoutError):
         while (left_s := deadline_s - time.monotonic()) > 0:
             stream.settimeout(left_s)
             line = lines.readline()
             if not line:
                 raise TsgtError("the master has ended")
+            if not greeted:  # before, it may act on the signal without sending us the event
+                greeted = True
+                _signal(pid)
             if line.startswith(b'{"type":"event"'):
                 record = json.loads(line)
                 if record["event"] in {"setup_applied", "setup_rejected"}:
                     return record["event"], record["message"]
     raise TsgtError(f"the master has not responded within {RESPONSE_TIMEOUT_S:g} s")
+
+
+def _signal(pid: int) -> None:
+    try:
+        os.kill(pid, RELOAD_SIGNAL)
+    except PermissionError as error:
+        raise TsgtError("this user may not signal the master: sudo systemctl reload tsgt-master") from error

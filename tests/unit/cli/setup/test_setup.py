@@ -282,3 +282,12 @@ def test_antenna_that_no_power_is_legal_with_is_refused(tsgt: Tsgt, pi: PiToSetU
     assert "EU433" in failed(done)
     assert "attenuator" in failed(done)
     assert not (pi.root / "etc/tsgt/master.toml").exists()
+
+
+def test_licence_lifts_the_limits_of_the_region(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """It stands in the configuration, also after the next run."""
+    options = ("--region", "EU433", "--stations", 3, "--antenna-gain-dbi", 9, "--licence", "CEPT 4711")
+    assert tsgt("setup", "master", "--yes", *options).code == 0
+    assert tsgt("setup", "master", "--yes", "--stations", 2).code == 0
+    config = load(pi.root / "etc/tsgt/master.toml", MasterConfig)
+    assert (config.radio.licence, len(config.stations)) == ("CEPT 4711", 2)

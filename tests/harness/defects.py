@@ -72,8 +72,8 @@ def acknowledge_before_written(planting: Planting) -> None:
     """Acknowledge measurements before they are written."""
 
     def acknowledge(link: Any) -> None:
-        while link._unwritten:
-            reply = link._unwritten.popleft()
+        while link._unsynced:
+            reply = link._unsynced.popleft()
             link._master.station(reply.station).window.mark_written(reply.sequences)
 
     planting.replace_attribute(link.SuperframeLink, "_acknowledge", lambda _: acknowledge)

@@ -89,6 +89,7 @@ class MasterDependencies:
     read_setup: Callable[[], Parameters] | None = None
     """Reads the set-up files again, at the signal of :mod:`tsgt.master.reload`; raises ConfigError. None: the signal is not handled."""
     write: Callable[[int, memoryview], int] | None = None  # see :class:`~tsgt.recording.RecordingWriter`
+    sync: Callable[[int], None] | None = None  # likewise
     disk_status: Callable[[Path], DiskStatus | None] = disk_status
     """Returns the space on the disk of a folder; called in a thread."""
     start_check: StartCheck | None = None
@@ -119,7 +120,7 @@ async def run_master(
     )
     with (
         ThreadPoolExecutor(1, "imu_setup_check") as checks,
-        RecordingWriter(path, write=dependencies.write) as writer,
+        RecordingWriter(path, write=dependencies.write, sync=dependencies.sync) as writer,
         ExitStack() as stack,
     ):
         recorder = Recorder(writer)
@@ -182,7 +183,7 @@ async def run_master(
                 service.sd_notify("READY=1")
                 group.create_task(recording.run())
                 group.create_task(
-                    service.sync_periodically(writer.sync, clock, config.recording.fsync_interval_s)
+                    service.sync_periodically(recorder.sync, clock, config.recording.fsync_interval_s)
                 )
                 group.create_task(disk.measure_space(clock))
                 group.create_task(master.publish_due_poses())

@@ -7,6 +7,7 @@ import shutil
 from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
+from tsgt.errors import RecordingError
 from tsgt.master.disk_monitor import DiskMonitor
 from tsgt.recording import DiskStatus, RecordingStatus
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.clock import Clock
-    from tsgt.errors import RecordingError
     from tsgt.master.link_events import MasterEvent
     from tsgt.recording.recorder import Recorder
 
@@ -34,7 +34,8 @@ class RecordingThread:
         self._unix_now_ns = unix_now_ns
         self._last_write_ns: int | None = None
         self._pending = asyncio.Event()
-        self._flushed = asyncio.Event()
+        self._sync_requested = False
+        self._sync_done = asyncio.Event()
 
     @property
     def line_count(self) -> int:
@@ -61,28 +62,36 @@ class RecordingThread:
         self._recorder.put(line)
         self._pending.set()
 
-    def written(self, numbers: range) -> bool | None:
-        """Return whether lines are in the file; False: one is lost, None: one is pending."""
-        return self._recorder.written(numbers)
+    def synced(self, numbers: range) -> bool | None:
+        """Return whether lines are on the disk; False: one is lost, None: one is pending."""
+        return self._recorder.synced(numbers)
 
-    async def flushed(self, timeout_s: float) -> bool:
-        """Wait until some of the pending lines are written; return False after the timeout."""
-        self._flushed.clear()
+    async def sync(self, timeout_s: float) -> None:
+        """Bring all lines to the disk; wait until that has been tried, or for the timeout, after which it goes on."""
+        self._sync_requested = True
+        self._sync_done.clear()
+        self._pending.set()
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
-                return await self._flushed.wait()
-        return False
+                await self._sync_done.wait()
 
     async def run(self) -> NoReturn:
         """Write until cancelled."""
         while True:
             await self._pending.wait()
             self._pending.clear()
+            sync, self._sync_requested = self._sync_requested, False
             written_before = self._recorder.written_count
-            await asyncio.to_thread(self._recorder.flush)
+            await asyncio.to_thread(self._write_and_sync if sync else self._recorder.flush)
             if self._recorder.written_count > written_before:
                 self._last_write_ns = self._unix_now_ns()
-            self._flushed.set()
+            if sync:
+                self._sync_done.set()
+
+    def _write_and_sync(self) -> None:
+        self._recorder.flush()
+        with suppress(RecordingError):  # logged by the periodic sync
+            self._recorder.sync()
 
 
 class RecordingDisk:

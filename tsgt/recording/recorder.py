@@ -40,6 +40,7 @@ class Recorder:
         self._line_count = 0
         self.lost = 0
         self._written = 0
+        self._synced = 0
         self._lost_numbers: list[range] = []
 
     @property
@@ -54,9 +55,16 @@ class Recorder:
 
     def written(self, numbers: range) -> bool | None:
         """Return whether lines are in the file; False: one is lost, None: one is pending."""
+        return self._are_before(self._written, numbers)
+
+    def synced(self, numbers: range) -> bool | None:
+        """Return whether lines are on the disk, where a power cut leaves them; otherwise as :meth:`written`."""
+        return self._are_before(self._synced, numbers)
+
+    def _are_before(self, count: int, numbers: range) -> bool | None:
         if any(lost.start < numbers.stop and numbers.start < lost.stop for lost in self._lost_numbers):
             return False
-        return True if numbers.stop <= self._written else None
+        return True if numbers.stop <= count else None
 
     @property
     def failing(self) -> bool:
@@ -85,6 +93,12 @@ class Recorder:
         """Write pending lines in order; never raises because of the disk. May run in another thread."""
         with self._lock:
             self._write_pending()
+
+    def sync(self) -> None:
+        """Bring all written lines to the disk, in any thread. Raises RecordingError: those since the last sync may be lost."""
+        written = self._written
+        self._writer.sync()
+        self._synced = max(self._synced, written)
 
     def write_line(self, line: bytes) -> None:
         """Append a line after the pending ones; never raises because of the disk."""

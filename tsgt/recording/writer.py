@@ -31,15 +31,22 @@ class RecordingWriter:
 
     A line is in the kernel when :meth:`write` returns, and on the disk after the next :meth:`sync`. The file is locked:
     it has one writer at a time. The caller writes the header and the parameters that begin every session. ``path``: a
-    new file, or a recording to continue. ``write``: passes bytes to the kernel, default :func:`os.write`; simulations
-    use one that fails. ``size``: length of the file in bytes. ``cut_bytes``: length of the torn line that was cut off the end of the file; 0 when it was
+    new file, or a recording to continue. ``write`` passes bytes to the kernel, and ``sync`` brings them to the disk:
+    :func:`os.write` and :func:`os.fsync`, except in simulations. ``size``: length of the file in bytes. ``cut_bytes``: length of the torn line that was cut off the end of the file; 0 when it was
     complete. Raises RecordingError if the file cannot be opened, is not a recording, or another program is writing it.
     Raises RecordingVersionError if it is a recording of another version.
     """
 
-    def __init__(self, path: Path, *, write: Callable[[int, memoryview], int] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        write: Callable[[int, memoryview], int] | None = None,
+        sync: Callable[[int], None] | None = None,
+    ) -> None:
         self._path = path
         self._write_bytes = write
+        self._sync_file = sync
         self._sync_lock = threading.Lock()  # a sync may be running in a thread when the owner closes
         self._unsynced = True
         try:
@@ -137,7 +144,7 @@ class RecordingWriter:
                 return
             self._unsynced = False
             try:
-                os.fsync(self._fd)
+                (self._sync_file or os.fsync)(self._fd)
             except OSError as error:
                 self._unsynced = True
                 raise RecordingError(

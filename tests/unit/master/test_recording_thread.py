@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 from typing import TYPE_CHECKING
 
 from harness.field import running
@@ -22,16 +23,38 @@ async def test_lines_are_written_in_the_background(tmp_path: Path) -> None:
         writer.write(HEADER)
         disk = RecordingThread(Recorder(writer), lambda: 7)
         disk.put(b"{}")
-        assert disk.written(range(1)) is None
-        assert not await disk.flushed(0.015)  # nobody writes
+        await disk.sync(0.015)
+        assert disk.synced(range(1)) is None  # nobody writes
         async with running(disk.run()):
-            assert await disk.flushed(0.015)
-            assert disk.written(range(disk.line_count)) is True
-            assert not await disk.flushed(0.015)  # nothing to do
+            await disk.sync(0.015)
+            assert disk.synced(range(disk.line_count)) is True
             disk.put(b"{}")
-            await asyncio.sleep(0)
-            assert await disk.flushed(0.015)
+            await asyncio.sleep(0.015)
+            assert disk.status("run.jsonl").waiting_lines == 0
+            assert disk.synced(range(disk.line_count)) is None  # written, but a power cut would take it
+            await disk.sync(0.015)
+            assert disk.synced(range(disk.line_count)) is True
         status = disk.status("run.jsonl")
     assert (tmp_path / "run.jsonl").stat().st_size == status.bytes
     assert (status.last_write_ns, status.waiting_lines, status.lost_lines) == (7, 0, 0)
     assert (tmp_path / "run.jsonl").read_bytes().count(b"\n") == 3
+
+
+async def test_disk_that_fails_to_sync_is_not_waited_for(tmp_path: Path) -> None:
+    """Its lines do not count as synced until it works again."""
+    broken = True
+
+    def sync(_file: int) -> None:
+        if broken:
+            raise OSError(errno.EIO, "broken")
+
+    with RecordingWriter(tmp_path / "run.jsonl", sync=sync) as writer:
+        writer.write(HEADER)
+        disk = RecordingThread(Recorder(writer), lambda: 7)
+        async with running(disk.run()):
+            disk.put(b"{}")
+            await disk.sync(1e6)
+            assert disk.synced(range(1)) is None
+            broken = False
+            await disk.sync(1e6)
+            assert disk.synced(range(1)) is True

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tsgt.radio import Direction, LoRaSettings, Packet, Radio, Transmission
     from tsgt.radio.superframe import ReceivedReply, TimedMeasurement
 
-FLUSH_TIMEOUT_S = 0.015
+SYNC_TIMEOUT_S = 0.015
 """How long a beacon waits for the last reply to be written. Acknowledging a frame later costs a retransmission."""
 
 TRACK_RETRY_INTERVAL_NS = 30_000_000_000  # between two commands to track, while a station does not
@@ -34,7 +34,7 @@ TRACK_RETRY_INTERVAL_NS = 30_000_000_000  # between two commands to track, while
 log = structlog.get_logger()
 
 
-class _Unwritten(NamedTuple):
+class _Unsynced(NamedTuple):
     """The measurements of a reply, and the recording's lines that hold them."""
 
     station: int
@@ -76,7 +76,7 @@ class SuperframeLink:
             clock.monotonic_ns(),
             phase_lock=PhaseLock(timing, max(prisms)) if protocol.phase_lock else None,
         )
-        self._unwritten: deque[_Unwritten] = deque()
+        self._unsynced: deque[_Unsynced] = deque()
         self._track_commanded_ns: dict[int, int] = {}
         self._directions: dict[int, Direction] = {}
         self._beacons_ns: deque[int] = deque(maxlen=16)
@@ -102,15 +102,16 @@ class SuperframeLink:
     # --- FrameObserver ----------------------------------------------------------------------------------------------
 
     async def ready(self) -> None:
-        """Wait until the recording has taken what it was given, or no longer takes anything."""
+        """Wait a little for the disk to have the last replies; what it gets later is acknowledged a frame later."""
         self.exchange_start_ns = self._now_ns()
         self._acknowledge()
-        while self._unwritten and await self._recording.flushed(FLUSH_TIMEOUT_S):
+        if self._unsynced:
+            await self._recording.sync(SYNC_TIMEOUT_S)
             self._acknowledge()
         self._send_hints()
 
     def composing(self) -> None:
-        """Acknowledge what was written while the beacon was due."""
+        """Acknowledge what reached the disk while the beacon was due."""
         self._acknowledge()
 
     def beacon_sent(self, sent: Transmission) -> None:
@@ -141,7 +142,7 @@ class SuperframeLink:
         if reply.measurements:
             sequences = tuple(timed.sequence for timed in reply.measurements)
             lines = range(first_line, self._recording.line_count)
-            self._unwritten.append(_Unwritten(station, sequences, lines))
+            self._unsynced.append(_Unsynced(station, sequences, lines))
         if reply.rejected_beacons:
             report(link_events.BeaconTimeRejected(station, reply.rejected_beacons))
         if reply.link_delay_anomaly:
@@ -165,11 +166,11 @@ class SuperframeLink:
         return (self._beacons_ns[-1] - self._beacons_ns[0]) / (len(self._beacons_ns) - 1) / 1e6
 
     def _acknowledge(self) -> None:
-        """Mark measurements that were written, or lost, for the next acknowledgement."""
-        while self._unwritten and (written := self._recording.written(self._unwritten[0].lines)) is not None:
-            reply = self._unwritten.popleft()
+        """Mark measurements that are on the disk, or lost, for the next acknowledgement: a power cut takes none of them back."""
+        while self._unsynced and (synced := self._recording.synced(self._unsynced[0].lines)) is not None:
+            reply = self._unsynced.popleft()
             window = self._master.station(reply.station).window
-            (window.mark_written if written else window.mark_lost)(reply.sequences)
+            (window.mark_written if synced else window.mark_lost)(reply.sequences)
 
     def _report_state(self, reply: ReceivedReply, now_ns: int) -> None:
         """Report the state of a station, and command one to track that does not track its prism."""

@@ -298,6 +298,8 @@ class StationParameters(FiniteNumbers):
     """Scale correction of the slope distance in 1e-6, only what the instrument did not apply itself."""
     latency_ns: int = 0
     """From the measurement to its host stamp, in ns; subtracted from the stamp. Positive: the stamp is late."""
+    time_sigma_s: float = 0.0
+    """One sigma of its host stamps in s, beyond that of an instrument on a cable, which is known."""
     vertical_index_rad: float = 0.0
     """Vertical index error in rad: the zenith angle (first face) that the instrument reads, less the true one."""
     collimation_rad: float = 0.0
@@ -320,6 +322,7 @@ class StationParameters(FiniteNumbers):
             prism_constant_m=(-10, 10),
             atmospheric_ppm=(-1e4, 1e4),
             latency_ns=(-(10**12), 10**12),
+            time_sigma_s=(0, 1),
             vertical_index_rad=(-0.1, 0.1),
             collimation_rad=(-0.1, 0.1),
         )

@@ -39,6 +39,8 @@ class StationConfig(Model):
     """Mean delay of the timestamp of a ping on the station's computer: 0.7 for the authors' nodes, which poll."""
     latency_ms: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """Latency from the measurement to its timestamp, subtracted from it. Positive: the timestamp is late."""
+    time_sigma_ms: Annotated[float, Field(ge=0, le=1e3)] = 0.0
+    """One sigma of its timestamps beyond that of an instrument on a cable: over a network `stamp_sigma_ns` of its journal."""
     noise: NoiseConfig = NoiseConfig()
     """Noise of one measurement."""
     noise_scale: tuple[NoiseFactor, NoiseFactor, NoiseFactor] = (1.0, 1.0, 1.0)

@@ -108,6 +108,7 @@ def _station(config: StationConfig) -> StationParameters:
         prism_constant_m=config.prism_constant_mm / 1e3,
         atmospheric_ppm=config.atmospheric_ppm,
         latency_ns=round(config.latency_ms * 1e6),
+        time_sigma_s=config.time_sigma_ms / 1e3,
         noise=noise(config.noise),
         noise_scale=config.noise_scale,
     )

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tsgt.geometry import FloatArray
-    from tsgt.model import InstrumentNoise, Measurement, Parameters
+    from tsgt.model import InstrumentNoise, Measurement, Parameters, StationParameters
 
 INSTRUMENT_TIME_SIGMA_S = 6e-4
 FIRST_TIME_SIGMA_S = 3e-3
@@ -94,7 +94,13 @@ def build_observations(
     return (
         Observations(
             time_s=np.array([time_ns - origin_ns for (time_ns, _), _ in ordered], dtype=np.int64) / 1e9,
-            time_sigma_s=np.array([_time_sigma_s(m) for m in sources], dtype=np.float64),
+            time_sigma_s=np.array(
+                [
+                    _time_sigma_s(m, parameters.stations[row])
+                    for m, ((_, row), _) in zip(sources, ordered, strict=True)
+                ],
+                dtype=np.float64,
+            ),
             points_m=points,
             sigmas_m=np.maximum(sigmas, MIN_SIGMA_M),
             polar=~is_point,
@@ -107,12 +113,13 @@ def build_observations(
     )
 
 
-def _time_sigma_s(measurement: Measurement) -> float:
+def _time_sigma_s(measurement: Measurement, station: StationParameters) -> float:
     """Return one sigma of a measurement's time: of its stamp, and of the instrument's time that the stamp is based on."""
     stamp_sigma_s = getattr(measurement, "stamp_sigma_ns", 0) / 1e9
     if not stamp_sigma_s:  # imported: taken as exact
-        return 0.0
-    return math.hypot(stamp_sigma_s, instrument_time_sigma_s(measurement.sequence))
+        return station.time_sigma_s
+    instrument_s = instrument_time_sigma_s(measurement.sequence)
+    return math.hypot(math.hypot(stamp_sigma_s, instrument_s), station.time_sigma_s)
 
 
 def instrument_time_sigma_s(sequence: int) -> float:

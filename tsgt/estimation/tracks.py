@@ -5,6 +5,7 @@ Applies latency, instrument errors, prism constant, atmospheric scale and the st
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
@@ -134,10 +135,14 @@ def _track_of(station: StationParameters, measurements: Sequence[Measurement]) -
         np.array([measured_at_ns(m, station) for m in measurements], dtype=np.int64),
         points,
         covariances,
-        np.array([m.stamp_sigma_ns for m in polar] or [0] * len(measurements), dtype=np.int64),
+        np.array([_time_sigma_ns(m, station) for m in polar] or [0] * len(measurements), dtype=np.int64),
         np.full(len(measurements), station.station, dtype=np.int64),
     )
     return _EMPTY.merged(track)
+
+
+def _time_sigma_ns(measurement: PolarMeasurement, station: StationParameters) -> int:
+    return round(math.hypot(measurement.stamp_sigma_ns, 1e9 * station.time_sigma_s))
 
 
 def _from_polar(

@@ -31,6 +31,24 @@ def test_time_sigma_includes_the_instruments(stated_ns: int) -> None:
     assert observations.time_sigma_s == pytest.approx([expected_s], rel=1e-2)
 
 
+@pytest.mark.parametrize("stated_ns", [0, 30_000])
+def test_uncertain_times_of_a_station_enlarge_the_covariance(stated_ns: int) -> None:
+    """A station over a network, whose times are uncertain by 9 ms; the others are not concerned."""
+    stations = tuple(
+        replace(each, time_sigma_s=0.009 if each.station == 2 else 0.0) for each in SCENE.parameters.stations
+    )
+    parameters = replace(SCENE.parameters, stations=stations)
+    measured = [replace(SCENE.measure(s, 1.0), stamp_sigma_ns=stated_ns, sequence=10**7) for s in (1, 2)]
+    observations, _ = build_observations(parameters, measured, origin_ns=START)
+    cable_s = np.hypot(stated_ns / 1e9, INSTRUMENT_TIME_SIGMA_S if stated_ns else 0.0)
+    assert observations.time_sigma_s == pytest.approx([cable_s, np.hypot(cable_s, 0.009)], rel=1e-2)
+    tracks = build_tracks(parameters, measured)
+    assert [tracks[prism].time_sigmas_ns.tolist() for prism in (1, 2)] == [
+        [stated_ns],
+        [round(np.hypot(stated_ns, 9e6))],
+    ]
+
+
 def test_noise_has_a_minimum() -> None:
     """Noise has a minimum."""
     none = InstrumentNoise(range_sigma_m=0.0, range_sigma_ppm=0.0, angle_sigma_rad=0.0, pointing_sigma_m=0.0)

@@ -182,7 +182,8 @@ def _with_sigma(value: float, sigma: float, digits: int) -> str:
 
 def _hidden(found: Sequence[Comparison]) -> Section:
     labels = list(dict.fromkeys(step.label for each in found for step in each.steps))
-    positions, rotations = [], []
+    positions: list[tuple[str, ...]] = []
+    rotations: list[tuple[str, ...]] = []
     for label in labels:
         steps = [next((step for step in each.steps if step.label == label), None) for each in found]
         fairest = [step is each.steps[each.smallest_fair] for each, step in zip(found, steps, strict=True)]

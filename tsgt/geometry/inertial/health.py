@@ -127,7 +127,10 @@ class HealthMonitor:
         before = len(self._recent)
         values = np.concatenate([self._recent, values])
         same = np.zeros(values.shape, np.bool_)
-        same[1:] = np.abs(np.diff(values, axis=0)) <= _ROUNDING * np.abs(values[1:])
+        # Of a sensor as a whole: the product mixes its axes, of which one may be zero.
+        largest = np.abs(values.reshape(-1, 2, 3)).max(axis=2)
+        largest = np.repeat(np.maximum(largest[1:], largest[:-1]), 3, axis=1)
+        same[1:] = np.abs(np.diff(values, axis=0)) <= _ROUNDING * largest
         self._check_stuck(new, np.logical_and.reduce(same[before:], axis=1))
         at_limit = self._at_limit(values, same, float(np.median(new.duration_s)))[before:]
         for sensor, columns in (("angular rate", slice(0, 3)), ("specific force", slice(3, 6))):

@@ -105,6 +105,21 @@ def test_values_of_any_resolution_are_believed(step: float) -> None:
         assert {each for each in reasons if each != "it repeats the same values"} == {None}
 
 
+def test_zeros_of_a_coarse_gyro_are_no_small_steps() -> None:
+    """The gyro matrix mixes its axes: a zero is zero up to rounding only, and its changes are no steps of the device."""
+    matrix = np.array([[1.0, 3e-3, -2e-3], [4e-3, 1.0, 1e-3], [2e-3, 2e-3, 1.0]])
+    rest, drive = at_rest(), DRIVE.shaken(IMU).samples(IMU)
+    rates = np.concatenate([rest.angular_rate_radps[:400] - 0.01, drive.angular_rate_radps[400:]])
+    samples = quantised(replace(drive, angular_rate_radps=rates), 3e-3)
+    samples = replace(samples, angular_rate_radps=samples.angular_rate_radps @ matrix.T)
+    monitor = HealthMonitor(replace(IMU, gyro_matrix=matrix.tolist()))
+    reasons = set()
+    for start in range(0, len(samples), 10):
+        monitor.samples(samples.select(slice(start, start + 10)))
+        reasons.add(monitor.reason)
+    assert reasons - {"it repeats the same values"} == {None}
+
+
 def at_rest() -> InertialSamples:
     """Return noise and gravity."""
     rng = np.random.default_rng(3)

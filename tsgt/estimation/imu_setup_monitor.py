@@ -39,6 +39,8 @@ UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 INTERVAL_NS = 20_000_000_000
 RESULT_NS = 2_000_000_000  # From the start of a check to its result; a slow computer takes a second
 
+UNSAMPLED_S = 2.0  # By which measurements may precede the samples that they are compared with
+
 _POSE_DIM = 6
 
 _CONFIRMATION = "mounting, latency, axes and units of the IMU agree with the drive"
@@ -83,7 +85,11 @@ def check_recorded_setup(
     origin_ns = measurements[0].stamp_ns
     observations, _ = build_observations(parameters, measurements, origin_ns=origin_ns)
     samples = sound_samples(inertial_samples(records, imu, origin_ns), imu)
-    if not len(observations) or not len(samples):
+    if not len(samples):
+        return SetupCheck()
+    # A backlog arrives with measurements of times whose samples are held no more.
+    observations = observations.select(observations.time_s >= samples.end_s[0] - UNSAMPLED_S)
+    if not len(observations):
         return SetupCheck()
     rotation = rotation_from_quaternion(np.array(imu.orientation_xyzw))
     mounting = Mounting(rotation, np.array(imu.position_m) - centroid_m(parameters))

@@ -17,7 +17,8 @@ from harness.imu_calibration import (
 )
 from harness.records import SECOND, START
 
-from tsgt.estimation import ImuSetupMonitor, check_recorded_setup
+from tsgt.errors import GeometryError
+from tsgt.estimation import ImuSetupMonitor, check_recorded_setup, imu_setup_monitor
 from tsgt.geometry import exp_so3, quaternion_from_rotation, rotation_from_quaternion
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.model import ImuSamples, PointMeasurement
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial_calibration import Cause
+    from tsgt.geometry.trajectory import Observations
     from tsgt.model import ImuParameters, Parameters
     from tsgt.recording import EventRecord
 
@@ -200,6 +202,28 @@ def test_nothing_to_compare(*, prisms: int, measured: bool) -> None:
         for each in imu_records(found)
     ]
     assert check_recorded_setup(parameters, points, samples) == SetupCheck()
+
+
+@pytest.mark.parametrize("prisms", [3, 2])
+def test_backlog_is_not_compared_without_its_samples(prisms: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measurements of times long before the samples that are held; two seconds do no harm."""
+    compared: list[FloatArray] = []
+
+    def fit(observations: Observations, *_: object, **__: object) -> None:
+        compared.append(observations.time_s)
+        raise GeometryError("not fitted here")
+
+    monkeypatch.setattr(imu_setup_monitor, "fit_trajectory", fit)
+    monkeypatch.setattr(imu_setup_monitor, "fit_inertial_trajectory", fit)
+    found = uncalibrated_drive(8.0)
+    parameters = parameters_of(found, calibrated_imu(found))
+    parameters = replace(parameters, prisms=parameters.prisms[:prisms])
+    points = point_measurements(found)
+    samples = [each for each in imu_records(found) if each.stamp_ns[0] - points[0].stamp_ns > 5 * SECOND]
+    assert check_recorded_setup(parameters, points, samples) == SetupCheck()
+    (time_s,) = compared
+    assert 3.0 <= time_s[0] < 3.6
+    assert time_s[-1] > 7.0
 
 
 @pytest.mark.slow

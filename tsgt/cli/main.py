@@ -46,6 +46,7 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "Development": {
         "demo": ("simulate.demo:demo", "Run simulated stations and a master in real time."),
+        "rehearse": ("simulate.rehearse:rehearse", "Rehearse a day in the field, indoors."),
         "simulate": ("simulate.command:simulate_command", "Simulate a mission in virtual time."),
         "replay": ("live.replay:replay", "Stream a recording again."),
     },

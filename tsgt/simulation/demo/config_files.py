@@ -101,9 +101,17 @@ noise = {{ preset = {json.dumps(noise)} }}
 
 
 def write_demo_files(
-    folder: Path, scenario: ScenarioConfig, socket: Path, protocol: Protocol = "superframe"
+    folder: Path,
+    scenario: ScenarioConfig,
+    socket: Path,
+    protocol: Protocol = "superframe",
+    *,
+    region: str | None = None,
 ) -> DemoFiles:
-    """Write the configuration and setup files of a scenario, and a key, into an existing folder."""
+    """Write the configuration and setup files of a scenario, and a key, into an existing folder.
+
+    ``region``: whose law the simulated radios obey; None: none, as nothing is transmitted.
+    """
     files = DemoFiles(folder, socket, tuple(station.station for station in scenario.stations))
     parameters = scenario_parameters(scenario)
     frames = [
@@ -118,13 +126,14 @@ def write_demo_files(
     (folder / "prism_layout.toml").write_text("\n".join(['kind = "prism_layout"\n', *prisms]))
     if protocol == "superframe":
         write_key(files.key)
-    files.master_config.write_text(_master(files, scenario, protocol))
+    law = "" if region is None else f'region = "{region}"\n'
+    files.master_config.write_text(_master(files, scenario, protocol, law))
     for station in scenario.stations:
-        files.client_config(station.station).write_text(_client(files, scenario, station, protocol))
+        files.client_config(station.station).write_text(_client(files, scenario, station, protocol, law))
     return files
 
 
-def _master(files: DemoFiles, scenario: ScenarioConfig, protocol: Protocol) -> str:
+def _master(files: DemoFiles, scenario: ScenarioConfig, protocol: Protocol, law: str) -> str:
     stations = "\n".join(
         f"[[stations]]\nstation = {station.station}\nprism = {station.prism}\n"
         f"prism_constant_mm = {station.prism_constant_mm!r}\n"
@@ -142,7 +151,7 @@ kind = "master"
 station_frames = "station_frames.toml"
 prism_layout = "prism_layout.toml"
 
-{_radio(scenario, "master")}
+{_radio(scenario, "master", law)}
 {_SUPERFRAME if protocol == "superframe" else classic}
 [pipeline]
 {pipeline}
@@ -162,7 +171,9 @@ directory = "{files.recordings.name}"
 {stations}"""
 
 
-def _client(files: DemoFiles, scenario: ScenarioConfig, station: SimulatedStation, protocol: Protocol) -> str:
+def _client(
+    files: DemoFiles, scenario: ScenarioConfig, station: SimulatedStation, protocol: Protocol, law: str
+) -> str:
     number = station.station
     instrument = instrument_config(station, files.instrument_port(number))
     return f"""\
@@ -180,14 +191,14 @@ prism_constant_mm = {instrument.prism_constant_mm!r}
 latency_ms = {instrument.latency_ms!r}
 angle_delay_ms = {instrument.angle_delay_ms!r}
 
-{_radio(scenario, f"station{number}")}
+{_radio(scenario, f"station{number}", law)}
 {_SUPERFRAME if protocol == "superframe" else _CLASSIC}
 [journal]
 directory = "{files.journals(number).name}"
 """
 
 
-def _radio(scenario: ScenarioConfig, name: str) -> str:
+def _radio(scenario: ScenarioConfig, name: str, law: str) -> str:
     radio = scenario.radio
     return f"""\
 [radio]
@@ -199,7 +210,7 @@ spreading_factor = {radio.spreading_factor}  # 9 as in the paper; the authors' d
 bandwidth_khz = {radio.bandwidth_khz!r}
 coding_rate = {radio.coding_rate}
 power_dbm = {radio.power_dbm}
-"""
+{law}"""
 
 
 def _inline(values: dict[str, float | list[float]]) -> str:

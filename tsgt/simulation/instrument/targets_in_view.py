@@ -63,9 +63,18 @@ class TargetsInView:
             prism.prism: PrismVisibility(station, world, row, occluded_s)
             for row, prism in enumerate(scenario.prisms)
         }
+        self._foils_m = scenario.targets_m
+        self.foils = self._foils_from(station)  # foil targets in the frame of the station, each (3,) in m
+
+    def move(self, station: SimulatedStation) -> None:
+        """See everything from where this station says, and as the world is from now on."""
+        self.foils = self._foils_from(station)
+        for visibility in self.prisms.values():
+            visibility.move(station)
+
+    def _foils_from(self, station: SimulatedStation) -> list[NDArray[np.float64]]:
         T_station_station1 = invert(np.array(level_frame(station)))
-        # Foil targets in the frame of the station, each (3,) in m.
-        self.foils = [transform_points(T_station_station1, np.array(target)) for target in scenario.targets_m]
+        return [transform_points(T_station_station1, np.array(target)) for target in self._foils_m]
 
     def fault_at(self, world_s: float) -> str | None:
         """Return the scenario's fault at an instant, occlusions excluded."""

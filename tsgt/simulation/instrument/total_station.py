@@ -112,6 +112,11 @@ class SimulatedTotalStation(TotalStationModel):
         self._select_target(prism)
         self.telescope.follow(prism)
 
+    def set_up_at(self, station: SimulatedStation) -> None:
+        """Stand where this station says from now on, as if somebody had moved the tripod; the lock remains."""
+        self.advance()
+        self._targets.move(station)
+
     @property
     def blocked(self) -> bool:
         """Whether the line of sight is blocked at the telescope."""

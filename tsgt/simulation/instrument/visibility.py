@@ -61,6 +61,11 @@ class PrismVisibility:
         self._T_station_station1 = invert(np.array(level_frame(station)))
         self._blocks: dict[int, _Block] = {}
 
+    def move(self, station: SimulatedStation) -> None:
+        """See the prism from where this station says; forget what was computed ahead."""
+        self._T_station_station1 = invert(np.array(level_frame(station)))
+        self._blocks.clear()
+
     def point_at(self, world_s: float) -> NDArray[np.float64]:
         """Return the position in the frame of the station, (3,) in m, at an instant in s from the start."""
         point: NDArray[np.float64] = self._points(np.array([world_s]))[0]

@@ -109,6 +109,17 @@ def run(command: click.Command, arguments: list[str] | None = None) -> NoReturn:
     except TsgtError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(2 if isinstance(error, ConfigError) else 1)
+    except MemoryError:
+        click.echo("error: the memory is not sufficient for this input", err=True)
+        sys.exit(1)
+    except ValueError as error:
+        if type(error).__name__ != "LinAlgError":  # of numpy, which most commands do not load
+            raise
+        click.echo(
+            f"error: the computation fails ({error}): a sigma, a coordinate or a distance of the input is absurd",
+            err=True,
+        )
+        sys.exit(1)
     except BrokenPipeError:
         # The reader of our output has ended (`tsgt ... | head`); Python would complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +23,34 @@ DEFAULT_CLIENT_SOCKET = Path("/run/tsgt/client.sock")
 
 RECORDING_SUFFIXES = (".jsonl", ".json")
 
-path_type = click.Path(path_type=Path)
+_MEMORY_DEVICES = 1  # major number of /dev/null, zero, full, random and urandom
+
+
+class _FilePath(click.Path):
+    """A path; as an input no device that never ends, as an output also /dev/null and /dev/full."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Refuse a device before it is read."""
+        path = Path(str(super().convert(value, param, ctx)))
+        output = param is not None and "output" in (param.name or "")
+        if not output and _is_endless(path):
+            self.fail(f"{path} is a device, not a file", param, ctx)
+        return path
+
+
+def _is_endless(path: Path) -> bool:
+    try:
+        status = path.stat()
+    except (OSError, ValueError):  # who opens it says what is wrong
+        return False
+    endless = os.major(status.st_rdev) == _MEMORY_DEVICES and path.resolve() != Path(os.devnull)
+    return stat.S_ISBLK(status.st_mode) or (stat.S_ISCHR(status.st_mode) and endless)
+
+
+path_type = _FilePath()
 
 
 class FiniteRange(click.FloatRange):

@@ -243,6 +243,8 @@ class StationStatus:
     stamp_bound_ns: int | None = None
     joined: bool | None = None
     outstanding: int | None = None
+    drain_rate_hz: float | None = None
+    drain_s: float | None = None
     missed_slots: int | None = None
     rejected_beacons: int | None = None
     outside_lag_window: int | None = None

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 INSTRUMENT_TIME_SIGMA_S = 6e-4
 FIRST_TIME_SIGMA_S = 3e-3
+MAX_TIME_SIGMA_S = 100.0
 FIRST_TIMES = 5
 """Sigma of the conversion from an instrument's clock to its station's, which no stamp includes: steady state, with
 timestamps in whole ms, and first measurements, from where it falls with the square root of their number. The conversion
@@ -119,6 +120,8 @@ def _time_sigma_s(measurement: Measurement, station: StationParameters) -> float
     if not stamp_sigma_s:  # imported: taken as exact
         return station.time_sigma_s
     instrument_s = instrument_time_sigma_s(measurement.sequence)
+    # Beyond the limit a measurement has no weight; its square would overflow the solver.
+    stamp_sigma_s = min(stamp_sigma_s, MAX_TIME_SIGMA_S)
     return math.hypot(math.hypot(stamp_sigma_s, instrument_s), station.time_sigma_s)
 
 

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 RATE_WINDOW_NS = 10_000_000_000
 LOSS_WINDOW_EXCHANGES = 50
+DRAIN_WINDOW_NS = 60_000_000_000
+MIN_DRAIN_SPAN_NS = 10_000_000_000
+MAX_BACKLOG_SAMPLES = 61  # of a window, one a second
 
 _LOCKED = (Status.OK, Status.LOW_ACCURACY, Status.ANGLE_ONLY)
 
@@ -130,12 +133,16 @@ class _Station:
     superframe: SuperframeState | None = None
     outside_lag_window: int | None = None
     checked_ns: int | None = None
+    backlog: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_BACKLOG_SAMPLES))
 
     def status_at(self, number: int, now_ns: int, clock: ClockEstimate | None) -> StationStatus:
         while self.arrivals_ns and self.arrivals_ns[0] <= now_ns - RATE_WINDOW_NS:
             self.arrivals_ns.popleft()
         state = self.superframe
         condition = UNKNOWN_CONDITION if state is None else state.condition
+        drain_rate_hz = (
+            None if state is None or not state.joined else self._drain_rate_hz(now_ns, state.outstanding)
+        )
         return StationStatus(
             id=number,
             measurements=self.measurements,
@@ -155,6 +162,10 @@ class _Station:
             stamp_bound_ns=self.stamp_bound_ns,
             joined=None if state is None else state.joined,
             outstanding=None if state is None else state.outstanding,
+            drain_rate_hz=drain_rate_hz,
+            drain_s=None
+            if state is None or not drain_rate_hz or drain_rate_hz < 0
+            else state.outstanding / drain_rate_hz,
             missed_slots=None if state is None else state.missed_slots,
             rejected_beacons=None if state is None else state.rejected_beacons,
             outside_lag_window=self.outside_lag_window,
@@ -164,6 +175,15 @@ class _Station:
             problem=condition.problem,
             last_target_check_age_s=_age_s(self.checked_ns, now_ns),
         )
+
+    def _drain_rate_hz(self, now_ns: int, outstanding: int) -> float | None:
+        samples = self.backlog
+        if not samples or now_ns - samples[-1][0] >= MIN_DRAIN_SPAN_NS // 10:
+            samples.append((now_ns, outstanding))
+        while samples[0][0] <= now_ns - DRAIN_WINDOW_NS:
+            samples.popleft()
+        span_ns = now_ns - samples[0][0]
+        return None if span_ns < MIN_DRAIN_SPAN_NS else (samples[0][1] - outstanding) / (span_ns / 1e9)
 
     def _rate_hz(self, now_ns: int) -> float | None:
         if not self.measurements:

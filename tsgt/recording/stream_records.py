@@ -276,6 +276,10 @@ class StationStatus(FiniteNumbers):
     """Whether it has joined the present session of the master; null with the protocol classic."""
     outstanding: int | None = None
     """Measurements that were made but have not been received yet; null with the protocol classic."""
+    drain_rate_hz: float | None = None
+    """Decrease of ``outstanding`` per second over the last minute, negative while it grows; null before there are ten seconds."""
+    drain_s: float | None = None
+    """Time in s until none is outstanding, at that rate; null where it does not decrease."""
     missed_slots: int | None = None
     """Slots that stayed empty because its computer was late; null with the protocol classic."""
     rejected_beacons: int | None = None

@@ -115,6 +115,7 @@ def tile(
         "range_m": rounded(newest.range_m, 3) if newest is not None and fresh else None,
         "bound_ms": None if bound_ns is None else rounded(bound_ns / 1e6, 2),
         "backlog": station.outstanding,
+        "drain_s": rounded(station.drain_s, 0),
         "missed_slots": station.missed_slots,
         "rssi_dbm": rounded(station.rssi_dbm, 0),
         "snr_db": rounded(station.snr_db, 0),

@@ -246,3 +246,40 @@ def test_map_coordinates_are_accepted(good: dict[str, str], number: str) -> None
     with Files({name: text.encode() for name, text in (contents | {"c.toml": MASTER}).items()}) as files:
         outcome = check_command(files, ("config", "check", "@c.toml"))
     assert outcome.code == 0, outcome
+
+
+@pytest.mark.parametrize("sigma_ns", [10**15, 2**62])
+def test_absurd_sigma_of_a_time(good: dict[str, str], sigma_ns: int) -> None:
+    """Years of uncertainty at one station: its measurements have no weight, and no solver fails."""
+    lines = [
+        re.sub(r'"stamp_sigma_ns":\s*\d+', f'"stamp_sigma_ns":{sigma_ns}', line)
+        if '"station":1' in line
+        else line
+        for line in good["r.jsonl"].splitlines()
+    ]
+    content = {**good, "r.jsonl": "\n".join(lines) + "\n"}
+    assert content != good
+    with Files({key: text.encode() for key, text in content.items()}) as files:
+        assert check_command(files, ("process", "@r.jsonl"), output="o.tum").code == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("process", "/dev/zero"),
+        ("evaluate", "@r.jsonl", "--reference", "/dev/zero"),
+        ("compare", "@r.jsonl", "/dev/zero"),
+        ("calibrate", "targets", "/dev/zero"),
+        ("calibrate", "motion", "/dev/urandom"),
+        ("export", "/dev/zero", "--format", "csv"),
+        ("replay", "/dev/zero", "--no-wait"),
+        ("simulate", "/dev/zero"),
+        ("import", "rts", "--tracks", "/dev/zero", "/dev/zero", "/dev/zero", "--prisms", "/dev/zero"),
+    ],
+)
+def test_endless_file_is_refused_before_it_is_read(good: dict[str, str], arguments: tuple[str, ...]) -> None:
+    """A device is no file."""
+    with Files({key: text.encode() for key, text in good.items()}) as files:
+        outcome = check_command(files, arguments)
+    assert outcome.code == 2
+    assert "is a device" in outcome.err or "larger than 4 MB" in outcome.err

@@ -7,10 +7,11 @@ import sys
 from typing import TYPE_CHECKING
 
 import click
+import numpy as np
 import pytest
 from harness.records import POSE, recording_bytes
 
-from tsgt.cli.main import COMMANDS, GROUPS, HELP_OPTIONS, cli
+from tsgt.cli.main import COMMANDS, GROUPS, HELP_OPTIONS, cli, run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -135,3 +136,25 @@ def test_missing_library_is_reported_before_the_work(
     outcome = tsgt(*arguments)
     assert (outcome.code, outcome.out, outcome.err.count("\n")) == (1, "", 1)
     assert f"pip install 'tsgt[{extra}]'" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(np.linalg.LinAlgError("Singular matrix"), "Singular matrix"), (MemoryError(), "memory")],
+)
+def test_failure_of_a_solver_is_one_line(
+    error: Exception, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And so is memory that is not sufficient."""
+
+    @click.command()
+    def fail() -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as ending:
+        run(fail, [])
+    assert ending.value.code == 1
+    err = capsys.readouterr().err
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert words in err

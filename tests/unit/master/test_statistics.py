@@ -166,3 +166,32 @@ def test_superframe_state_is_reported() -> None:
         "tracking",
         None,
     )
+
+
+def test_drain_of_a_backlog_is_reported() -> None:
+    """Its speed over the last minute and its end; not before ten seconds, and no end while it grows."""
+    statistics = Statistics([2])
+
+    def after(second: int, outstanding: int) -> tuple[float | None, float | None]:
+        statistics.superframe_state(
+            SuperframeState(
+                2,
+                joined=True,
+                outstanding=outstanding,
+                missed_slots=0,
+                rejected_beacons=0,
+                condition=InstrumentCondition(),
+            )
+        )
+        station = statistics.status(second * SECOND).stations[0]
+        return station.drain_rate_hz, station.drain_s
+
+    assert after(100, 3000) == (None, None)
+    assert after(109, 2964) == (None, None)
+    assert after(110, 2960) == (4.0, 740.0)
+    for second in range(111, 300):
+        drained = after(second, 2960 - 2 * (second - 110))
+    assert drained == (2.0, (2960 - 2 * 189) / 2.0)
+    for second in range(300, 400):
+        drained = after(second, 2582 + 3 * (second - 299))
+    assert drained == (-3.0, None)

@@ -36,6 +36,9 @@ MAX_WRITE_AGE_S = 5.0
 MAX_MASTER_AGE_S = 10.0
 """While the master synchronises another station, a client receives nothing for a second or two."""
 
+MIN_BACKLOG = 20  # fewer measurements are merely on their way
+MAX_DRAIN_S = 1e6
+
 WIDTH = 40
 """Characters of the narrowest terminal used in the field."""
 
@@ -226,6 +229,7 @@ def _station_lines(station: StationStatus) -> list[str]:
         "rejected beacons": station.rejected_beacons,
     }
     lines += [f"  {count} {name}" for name, count in counts.items() if count]
+    lines += _drain_lines(station)
     if station.battery_percent is not None:
         lines.append(f"  battery {station.battery_percent} %")
     if station.atmospheric_ppm is not None:
@@ -237,6 +241,15 @@ def _station_lines(station: StationStatus) -> list[str]:
     if station.last_target_check_age_s is not None:
         lines.append(f"  targets checked {duration(station.last_target_check_age_s)} ago")
     return [line for line in lines if line.strip()]
+
+
+def _drain_lines(station: StationStatus) -> list[str]:
+    """Return how soon a backlog has arrived; nothing while only the newest measurements are on their way."""
+    if not station.outstanding or station.outstanding < MIN_BACKLOG or station.drain_rate_hz is None:
+        return []
+    if station.drain_s is None or station.drain_s > MAX_DRAIN_S:
+        return ["  the backlog does not shrink"]
+    return [f"  shrinks by {station.drain_rate_hz:.1f} a second, ends in {duration(station.drain_s)}"]
 
 
 def client_text(record: ClientStatus) -> tuple[list[str], bool]:

@@ -213,7 +213,9 @@ function showStations(stations) {
       ["rate", given(station.rate_hz, "Hz", 1)],
       ["range", given(station.range_m, "m", 2)],
       ["clock", station.bound_ms === null || station.bound_ms === undefined ? null : `±${station.bound_ms.toFixed(2)} ms`],
-      ["backlog", given(station.backlog, "")],
+      ["backlog", station.backlog > 20 && station.drain_s !== null && station.drain_s !== undefined
+        ? `${station.backlog}, ends in ${minutesAndHours(station.drain_s)}`
+        : given(station.backlog, "")],
       ["signal", given(station.rssi_dbm, "dBm", 0)],
       ["SNR", given(station.snr_db, "dB", 0)],
       ["loss", station.loss === null || station.loss === undefined ? null : `${(100 * station.loss).toFixed(0)} %`],

@@ -462,3 +462,23 @@ def test_master_text_of_the_superframe() -> None:
     assert "1 rejected beacons" in plain
     assert "missed" not in plain
     assert "NO KEY" not in "\n".join(master_text(dataclasses.replace(record, authenticated=True))[0])
+
+
+@pytest.mark.parametrize(
+    ("outstanding", "rate_hz", "drain_s", "line"),
+    [
+        (3120, 4.0, 780.0, "  shrinks by 4.0 a second, ends in 13 min"),
+        (3120, -2.5, None, "  the backlog does not shrink"),
+        (12, 4.0, 3.0, ""),
+        (3120, None, None, ""),
+    ],
+)
+def test_drain_of_a_backlog_is_shown(
+    outstanding: int, rate_hz: float | None, drain_s: float | None, line: str
+) -> None:
+    """Its speed and its end, where there is one."""
+    station = dataclasses.replace(STATION, outstanding=outstanding, drain_rate_hz=rate_hz, drain_s=drain_s)
+    text, _ = master_text(dataclasses.replace(MASTER, stations=(station,)))
+    plain = [entry.rstrip() for block in text for entry in block.splitlines()]
+    shown = [entry for entry in plain if "shrink" in entry]
+    assert [entry.strip() for entry in shown] == ([line.strip()] if line else [])

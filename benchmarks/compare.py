@@ -1,12 +1,16 @@
 """Accuracy of the joint fit of `tsgt compare`: simulated estimates with unknown clock, extrinsic and frame.
 
     python benchmarks/run.py compare [--scenarios dynamic quarry ski-trail] [--kinds lidar visual-inertial gnss]
-        [--seeds 100] [--first 0] [--duration 300] [--json FILE]
+        [--seeds 100] [--first 0] [--duration 300] [--evo 0] [--json FILE] [--read FILE...]
+        [--mission POSES TRUTH]
 
 The reference has poses at 20 Hz and errors like those of processed missions: in sigma, correlation, and independence of its poses.
-Prints, per scenario and kind of estimate: errors of time offset (ms), lever arm (mm, largest component) and rotation of the sensor
-(deg, largest component) where observable, the share of all these within two stated sigmas, and the ratio of the position ATE after
-the fit, aligned rigidly, to that with the true relation.
+Prints rows of three tables, per scenario and kind of estimate. The fit, rms error and the Cramér-Rao bound that knows how large all
+errors are: time offset (ms; share within 1 ms), lever arm x and y, z (mm), rotation of the sensor (deg), share within two stated
+sigmas (%), ratio of the position ATE after the fit, aligned rigidly, to that with the true relation (share within 5 %). The frame: with
+an alignment at the start and over all, share within two stated sigmas (%), NEES of the estimate's own covariance over its expectation
+(median). With --evo, medians of the ATE in mm: true, ours, evo's with the true offset given, evo's with none; and the largest
+difference of evo's ATE and RPE of our pairs to ours (m).
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ import argparse
 import json
 import math
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,12 +33,15 @@ from scipy.ndimage import gaussian_filter1d
 from tsgt.analysis.compare import Estimate, FitSettings, ReferencePoses, Relation, nested_fits, pair
 from tsgt.analysis.compare.drifting_frame import NAMES, Unknowns, linearise, rows_of, solve, start_states
 from tsgt.analysis.compare.errors import nees
+from tsgt.analysis.compare.fit_uncertainty import WEAK_SIGMA
 from tsgt.analysis.compare.frame_alignment import FRAME_NAMES
 from tsgt.analysis.compare.interpolation import ReferenceTrajectory
 from tsgt.analysis.compare.pairing import on_reference_clock
 from tsgt.analysis.compare.reference_error import as_white, own_covariance, whiten
 from tsgt.analysis.compare.relative import relative
+from tsgt.analysis.formats.trajectories import read_reference_poses
 from tsgt.geometry import (
+    align,
     covariance_over_lever_arm,
     exp_so3,
     log_so3,
@@ -111,6 +119,25 @@ def simulated(
     return reference, exact, made
 
 
+def of_mission(
+    poses: Path, truth: Path, model: EstimateModel, seed: int
+) -> tuple[ReferencePoses, ReferencePoses, SimulatedEstimate]:
+    """Return a processed mission, its truth, and an estimate simulated from that."""
+    rng = np.random.default_rng([seed, 77])
+    reference, true = read_reference_poses(poses), read_reference_poses(truth)
+    trajectory, start_ns = ReferenceTrajectory(true), int(true.stamp_ns[0])
+    until_s = (int(true.stamp_ns[-1]) - start_ns) / 1e9
+
+    def truth_at(at_s: FloatArray) -> FloatArray:
+        stamp_ns = start_ns + np.rint(np.clip(at_s, 0.0, until_s) * 1e9).astype(np.int64)
+        return trajectory.motion_at(stamp_ns).transform
+
+    relation = draw_relation(model, rng)
+    made = simulate_estimate(model, relation, truth_at, until_s - 0.3, rng, start_ns=start_ns)
+    exact_T = truth_at((reference.stamp_ns - start_ns) / 1e9)
+    return reference, replace(reference, T_station1_point=exact_T, covariance=None), made
+
+
 def errors(found: Fit, made: SimulatedEstimate) -> dict[str, float]:
     """Return the errors of the fitted unknowns by name, without those of the frame."""
     truth, relation = made.truth, found.relation
@@ -184,7 +211,7 @@ def evo_figures(
     def trajectory(stamp_ns: Any, position_m: FloatArray, rotation: FloatArray) -> Any:
         xyzw = quaternion_from_rotation(rotation)
         return evo_trajectory.PoseTrajectory3D(
-            position_m, np.roll(xyzw, 1, axis=1), (stamp_ns - START_NS) / 1e9
+            position_m, np.roll(xyzw, 1, axis=1), (stamp_ns - reference.stamp_ns[0]) / 1e9
         )
 
     def rmse(metric: Any, first: Any, second: Any) -> float:
@@ -214,10 +241,22 @@ def evo_figures(
     return found
 
 
-def one(scenario: str, kind: str, seed: int, duration_s: float, *, with_evo: bool) -> dict[str, Any]:
-    """Fit one estimate; returns errors and sigmas."""
+def one(
+    scenario: str,
+    kind: str,
+    seed: int,
+    duration_s: float,
+    *,
+    with_evo: bool,
+    mission: tuple[Path, Path] | None = None,
+) -> dict[str, Any]:
+    """Fit one estimate; returns errors and sigmas. ``mission``: files of its poses and of its truth."""
     model = KINDS[kind]
-    reference, exact, made = simulated(scenario, model, seed, duration_s)
+    if mission is None:
+        reference, exact, made = simulated(scenario, model, seed, duration_s)
+    else:
+        poses, true_poses = mission
+        reference, exact, made = of_mission(poses, true_poses, model, seed)
     estimate = Estimate(kind, made.stamp_ns, made.position_m, made.orientation_xyzw, made.covariance)
     settings = FitSettings(frozenset({"offset", "extrinsic", "frame"}), "rigid")
     with Stopwatch() as stopwatch:
@@ -227,8 +266,8 @@ def one(scenario: str, kind: str, seed: int, duration_s: float, *, with_evo: boo
     error = {name: value for name, value in errors(found, made).items() if name in sigma}
     pairs, exact_pairs = (pair(each, estimate, found.relation) for each in (reference, exact))
     normalised = {
-        align: nees(each)
-        for align, each in (("start", pair(reference, estimate, start.relation)), ("rigid", pairs))
+        alignment: nees(each)
+        for alignment, each in (("start", pair(reference, estimate, start.relation)), ("rigid", pairs))
     }
     result = {
         "scenario": scenario,
@@ -239,19 +278,20 @@ def one(scenario: str, kind: str, seed: int, duration_s: float, *, with_evo: boo
         "bound": bound(reference, estimate, model, made.truth),
         "bound_exact": bound(exact, estimate, model, made.truth),
         "frame": {
-            align: {
+            alignment: {
                 name: [value, _sigmas(each)[name]]
                 for name, value in frame_errors(each.relation, made).items()
                 if name in each.names
             }
-            for align, each in (("start", start), ("rigid", found))
+            for alignment, each in (("start", start), ("rigid", found))
         },
         "nees": {a: each.statistics.mean / each.degrees_of_freedom for a, each in normalised.items() if each},
         "unobservable": found.unobservable,
         "used": float(found.used.mean()),
         "ate_m": _ate_m(pairs),
+        "ate_sigma_m": found.ate_sigma_m,
         "exact_ate_m": _ate_m(exact_pairs),
-        "true_ate_m": made.ate_position_m("rigid"),
+        "true_ate_m": _true_ate_m(made, exact_pairs),
         "cpu_s": stopwatch.cpu_s,
     }
     if with_evo:
@@ -269,46 +309,84 @@ def _sigmas(found: Fit) -> dict[str, float]:
     return dict(zip(found.names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
 
 
+def _true_ate_m(made: SimulatedEstimate, pairs: PairedPoses) -> float:
+    """Return the ATE with the true relation, of the poses that were compared."""
+    estimated, true = (T[pairs.row, :3, 3] for T in (made.T_station1_estimated, made.T_station1_sensor))
+    aligned = align(estimated, true).T
+    return _rms(np.linalg.norm(estimated @ aligned[:3, :3].T + aligned[:3, 3] - true, axis=1))
+
+
 def _ate_m(pairs: PairedPoses) -> float:
     return _rms(np.linalg.norm(pairs.estimated[:, :3, 3] - pairs.reference[:, :3, 3], axis=1))
 
 
-def summary(results: list[dict[str, Any]]) -> str:
-    """Return a line of figures of one scenario and kind."""
-    names = sorted({name for r in results for name in r["error"]})
-    offset = np.array([1e3 * r["error"]["offset_s"] for r in results if "offset_s" in r["error"]])
-    groups = {"mm": (1e3, "_m"), "deg": (np.degrees(1.0), "_rad")}
-    words = [f"{results[0]['scenario']:9} {results[0]['kind']:15} n={len(results)}"]
-    words.append(f"offset rms {_rms(offset):.3f} max {np.abs(offset).max():.3f} ms")
-    for unit, (factor, ending) in groups.items():
-        worst = np.array(
-            [
-                factor * max((abs(v) for n, v in r["error"].items() if n.endswith(ending)), default=0.0)
-                for r in results
-            ]
+def summary(results: list[dict[str, Any]]) -> list[str]:
+    """Return three rows of tables about one scenario and kind: the fit, its sigmas, and evo's figures beside ours."""
+    first = f"| `{results[0]['scenario']}` | {results[0]['kind']} |"
+    offset_ms = 1e3 * _values(results, ["offset_s"])
+    normalised = np.array([r["error"][n] / r["sigma"][n] for r in results for n in r["error"]])
+    ratio = np.array([r["exact_ate_m"] / r["true_ate_m"] for r in results])
+    arms, turns = (
+        [f"extrinsic_{axis}_m" for axis in "xyz"],
+        [f"extrinsic_{axis}_rad" for axis in ("roll", "pitch", "yaw")],
+    )
+    fitted = (
+        f"{_against_bound(results, ['offset_s'], 1e3, 2)} ({100 * np.mean(np.abs(offset_ms) <= 1.0):.0f} %)",
+        _against_bound(results, arms[:2], 1e3, 1),
+        _against_bound(results, arms[2:], 1e3, 1),
+        _against_bound(results, turns, math.degrees(1.0), 3),
+        f"{100 * np.mean(np.abs(normalised) <= 2.0):.0f}",
+        f"{ratio.min():.2f} to {ratio.max():.2f} ({100 * np.mean(np.abs(ratio - 1.0) <= 0.05):.0f} %)",
+    )
+    frames = []
+    for alignment in ("start", "rigid"):
+        framed = np.array([e / s for r in results for e, s in r["frame"][alignment].values()])
+        consistency = np.median([r["nees"][alignment] for r in results])
+        frames += [f"{100 * np.mean(np.abs(framed) <= 2.0):.0f}", f"{consistency:.2f}"]
+    rows = [f"{first} {' | '.join(fitted)} |", f"{first} {' | '.join(frames)} |"]
+    beside = [r for r in results if "evo" in r]
+    if beside:
+        figures = [
+            (r["true_ate_m"], r["exact_ate_m"], r["evo"]["ape_known_offset_m"], r["evo"]["ape_m"])
+            for r in beside
+        ]
+        medians = (1e3 * np.median(np.array(figures), axis=0)).tolist()
+        difference = max(
+            max(
+                abs(r["evo"]["same_pairs_ape_m"] - r["ate_m"]), abs(r["evo"]["same_pairs_rpe_m"] - r["rpe_m"])
+            )
+            for r in beside
         )
-        words.append(
-            f"extrinsic p50 {np.median(worst):.3f} p95 {np.quantile(worst, 0.95):.3f} max {worst.max():.3f} {unit}"
-        )
-    within = {n: [abs(r["error"][n]) <= 2 * r["sigma"][n] for r in results if n in r["error"]] for n in names}
-    everything = [w for values in within.values() for w in values]
-    words.append(f"within 2 sigma {100 * np.mean(everything):.1f} %")
-    for name, words_of in (("ate_m", "against the reference"), ("exact_ate_m", "against the truth")):
-        ratio = np.array([r[name] / r["true_ate_m"] for r in results])
-        share = 100 * np.mean(np.abs(ratio - 1) <= 0.05)
-        words.append(f"ATE {words_of} {ratio.min():.3f}..{ratio.max():.3f}, {share:.0f} % within 5 %")
-    words.append(f"true ATE {1e3 * np.median([r['true_ate_m'] for r in results]):.0f} mm")
-    words.append(f"cpu {np.mean([r['cpu_s'] for r in results]):.2f} s")
-    lines = ["; ".join(words)]
-    for n in names:
-        e = np.array([r["error"][n] for r in results if n in r["error"]])
-        s = np.array([r["sigma"][n] for r in results if n in r["error"]])
-        factor, unit = (1e3, "mrad") if n.endswith("rad") else (1e3, "m" + n[-1])
-        lines.append(
-            f"    {n:22} observable {len(e):3}/{len(results)}  rms {factor * _rms(e):7.3f} {unit}  sigma {factor * np.median(s):7.3f}"
-            f"  z rms {_rms(e / s):.2f}  within {100 * np.mean(np.abs(e) <= 2 * s):.0f} %"
-        )
-    return "\n".join(lines)
+        rows.append(f"{first} {' | '.join(f'{value:.0f}' for value in medians)} | {difference:.0e} |")
+    return rows
+
+
+def determined(results: list[dict[str, Any]]) -> str:
+    """Return how many components were not named as weakly determined, and how many of these are within the limits."""
+    within = [
+        abs(r["error"][name]) <= 2.0 * WEAK_SIGMA[name]
+        for r in results
+        for name in r["error"]
+        if r["sigma"][name] <= WEAK_SIGMA[name]
+    ]
+    everything = [abs(r["error"][n]) <= 2.0 * r["sigma"][n] for r in results for n in r["error"]]
+    ate = [abs(r["exact_ate_m"] - r["true_ate_m"]) <= 2.0 * r["ate_sigma_m"] for r in results]
+    return (
+        f"{100 * np.mean(ate):.0f} % of ATE within two of their sigmas of the true ones; {100 * np.mean(everything):.1f} % of {len(everything)} components within two sigmas; {len(within)} determined within 1 ms, "
+        f"5 mm or 0.1 degrees by their sigma, {100 * np.mean(within):.1f} % of these are"
+    )
+
+
+def _values(results: list[dict[str, Any]], names: list[str], key: str = "error") -> FloatArray:
+    return np.array([r[key][name] for r in results for name in names if name in r["error"]])
+
+
+def _against_bound(results: list[dict[str, Any]], names: list[str], factor: float, digits: int) -> str:
+    if not len(_values(results, names)):
+        return ""
+    return " / ".join(
+        f"{factor * _rms(_values(results, names, key)):.{digits}f}" for key in ("error", "bound")
+    )
 
 
 def _rms(values: FloatArray) -> float:
@@ -325,19 +403,38 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--duration", type=float, default=300.0)
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--evo", type=int, default=0, help="Number of seeds with evo's figures, too.")
+    parser.add_argument("--json", type=Path, help="File of all errors to write.")
+    parser.add_argument(
+        "--read", type=Path, nargs="+", help="Files of all errors that are summarised, instead."
+    )
+    parser.add_argument(
+        "--mission", type=Path, nargs=2, help="Processed poses and truth (.tum) of one of --scenarios."
+    )
     options = parser.parse_args()
-    results = []
+    seeds = range(options.first, options.first + options.seeds)
+    results = [r for path in options.read or () for r in json.loads(path.read_text())]
+    rows: list[list[str]] = []
     for scenario in options.scenarios:
         for kind in options.kinds:
-            seeds = range(options.first, options.first + options.seeds)
-            own = [
-                one(scenario, kind, seed, options.duration, with_evo=seed < options.first + options.evo)
-                for seed in seeds
-            ]
-            results += own
-            print(summary(own), flush=True)
+            if options.read is None:
+                results += [
+                    one(
+                        scenario,
+                        kind,
+                        seed,
+                        options.duration,
+                        with_evo=seed < options.first + options.evo,
+                        mission=None if options.mission is None else tuple(options.mission),
+                    )
+                    for seed in seeds
+                ]
+            own = [r for r in results if (r["scenario"], r["kind"]) == (scenario, kind)]
+            if own:
+                rows.append(summary(own))
+    for table in zip_longest(*rows, fillvalue=""):
+        print("\n".join(table), end="\n\n")
+    print(determined(results))
     if options.json is not None:
         options.json.write_text(json.dumps(results, indent=1))
 

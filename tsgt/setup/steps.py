@@ -246,10 +246,11 @@ def start_step(system: System, role: Role, *, changed: bool) -> Step:
     active = system.run(("systemctl", "is-active", role.unit)).code == 0
     if active and not changed:
         return Step(name="service", detail=f"{role.unit} is running")
+    failure = f"{role.unit} does not start: journalctl -u {role.unit} -b -n 20"
     return Step(
         name="service",
         detail=f"{role.unit} is running",
-        changes=(RunCommand(("systemctl", "restart", role.unit)),),
+        changes=(RunCommand(("systemctl", "restart", role.unit), failure=failure),),
     )
 
 

@@ -129,12 +129,14 @@ class WriteFile:
 class RunCommand:
     """Run a command of the system.
 
-    ``live``: only on the running machine, not for an image. ``required``: whether a failure ends the setup.
+    ``live``: only on the running machine, not for an image. ``required``: whether a failure ends the setup. ``failure``:
+    what to say then; empty: the last line of its output.
     """
 
     arguments: tuple[str, ...]
     live: bool = False
     required: bool = True
+    failure: str = ""
 
     def __str__(self) -> str:
         return f"run {' '.join(self.arguments)}"
@@ -146,7 +148,7 @@ class RunCommand:
         ran = system.run(self.arguments)
         if ran.code != 0 and self.required:
             said = ran.output.strip().splitlines()[-1:] or [f"exit code {ran.code}"]
-            raise SetupError(f"{' '.join(self.arguments)}: {said[0]}")
+            raise SetupError(self.failure or f"{' '.join(self.arguments)}: {said[0]}")
 
 
 Change = WriteFile | RunCommand

@@ -14,7 +14,7 @@ from tsgt.cli import doctor
 from tsgt.cli.config import problems_at_start
 from tsgt.cli.doctor import LABELS
 from tsgt.cli.setup.options import answer
-from tsgt.config import MasterConfig, Model, WiringConfig, find_problems
+from tsgt.config import Model, WiringConfig, find_problems
 from tsgt.doctor import run_checks
 from tsgt.errors import RadioError
 from tsgt.log import configure_logging
@@ -165,13 +165,13 @@ def configure(
     text: str | None,
     *,
     key: bytes | None,
-    expected: Collection[str],
+    expected: Collection[str] = (),
     network: bool = False,
 ) -> None:
     """Install key, configuration and service, check the machine, and start the service.
 
     ``text``: of the configuration; None keeps the one that is there. ``expected``: checks that fail until the machine is
-    complete, because an instrument or a calibration is still missing.
+    complete, because the instrument is still missing.
     ``network``: whether the instrument is in the network, which the service may use then.
     """
     system, role = session.system, session.role
@@ -222,14 +222,6 @@ def _problems(session: Session, text: str) -> list[str]:
         if content is not None:
             owner = user[0] if system.uid == 0 and user is not None else None
             problems = problems_at_start(trial, content, key_owner=owner)
-        if isinstance(content, MasterConfig):
-            # They come from the calibration of the day.
-            later = [
-                path
-                for path in (content.setup.station_frames, content.setup.prism_layout)
-                if not path.exists()
-            ]
-            problems = [problem for problem in problems if problem.path not in later]
     finally:
         trial.unlink(missing_ok=True)
     return [str(problem).replace(str(trial), role.config) for problem in problems]

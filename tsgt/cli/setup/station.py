@@ -62,7 +62,7 @@ def run_station_setup(
         config = configuration_before(session, ClientConfig)
         before = None if config is None else StationAnswers.of(config)
         if config is not None and before is None and not common.replace_config:
-            configure(session, common, None, key=None, expected=())
+            configure(session, common, None, key=None)
             return session.finish()
         shared = _mission(session, mission, config if before is not None else None)
         number = answer(

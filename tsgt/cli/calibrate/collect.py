@@ -73,7 +73,9 @@ def collect(
     if missing:
         click.echo(f"{output}: {missing} measurements are missing; the same command continues", err=True)
     else:
-        click.echo(f"{output}: complete. Next: tsgt calibrate targets {output}", err=True)
+        click.echo(
+            f"{output}: complete. Next: tsgt calibrate targets {output} --apply {config_path}", err=True
+        )
 
 
 async def collect_targets(

@@ -24,6 +24,7 @@ MAX_BASELINE_NS = 1_100_000_000  # Estimates at 1 Hz
 MIN_OVERLAP_S = 10.0  # Of both, for a correlation to mean anything
 MIN_CORRELATION, CLEAR_CORRELATION = 0.3, 0.7
 AMBIGUOUS_SHARE = 0.6  # Of the largest log-likelihood; of the right offset, others have less than half
+REST_MPS, REST_RADPS = 0.03, 0.03  # Below, a motion may be noise of the reference
 TURN_RATE_SIGMA_RADPS = 0.02
 VELOCITY_SIGMA_MPS = 0.15  # A lever arm, not yet known, moves with the turn rate
 
@@ -76,7 +77,7 @@ def offset_by_correlation(
 ) -> float:
     """Return the time offset, in s, at which turn rates and speeds of estimate and reference agree best.
 
-    Within ``max_offset_s`` of ``start_s``; this itself where both overlap for less than 10 s. Norms need neither frame nor extrinsic.
+    Within ``max_offset_s`` of ``start_s``; this itself if both overlap for less than 10 s, or the robot stands. Norms need neither frame nor extrinsic.
     Masked normalised correlation (D. Padfield, 2012), so that gaps count as unknown; the best offset is the most likely one, as a
     correlation over a short overlap is more often high by chance. Raises ValueError: the motion agrees nowhere, or elsewhere, too.
     """
@@ -96,6 +97,15 @@ def offset_by_correlation(
         + np.arange((int(motion.stamp_ns[-1]) + start_ns - own_first_ns) // step_ns + 1) * step_ns
     )
     reference = trajectory.motion_at(grid_ns)
+    at_rest = (
+        np.quantile(each[reference.known], 0.99) < limit
+        for each, limit in (
+            (_norm(reference.velocity_mps), REST_MPS),
+            (_norm(reference.angular_velocity_radps), REST_RADPS),
+        )
+    )
+    if not reference.known.any() or all(at_rest):
+        return start_s
     own_known, columns = _on_grid(motion, own_ns - start_ns)
     norms = [(_norm(reference.velocity_mps), columns[0])]
     if motion.turn_rate_radps is not None:

@@ -133,6 +133,21 @@ def test_offset_of_a_motion_that_repeats_itself_is_refused() -> None:
     assert abs(fit(laps, estimate, replaced(settings, 5.0)).relation.offset_s) < 0.01
 
 
+def test_offset_of_a_robot_at_rest_is_unobservable() -> None:
+    """It is named, and left as given; a difference of noises is no disagreement."""
+    made = reference(40.0)
+    still = transform_from(np.eye(3), np.random.default_rng(3).normal(0.0, 1e-4, (len(made.stamp_ns), 3)))
+    rows = slice(20, 780, 2)
+    estimate = Estimate(
+        "still", made.stamp_ns[rows], still[rows, :3, 3], quaternion_from_rotation(still[rows, :3, :3]), None
+    )
+    found = fit(
+        dataclasses.replace(made, T_station1_point=still), noisy(estimate, 4), FitSettings(align="start")
+    )
+    assert found.relation.offset_s == 0.0
+    assert "offset_s" in found.unobservable
+
+
 def replaced(settings: FitSettings, max_offset_s: float) -> FitSettings:
     """Return settings with another search."""
     return dataclasses.replace(settings, max_offset_s=max_offset_s)

@@ -13,7 +13,7 @@ from vm.guest import Guest, State, kvm_works
 from vm.image import CACHE, ROOT, Image, image, missing_tools
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 @pytest.fixture(scope="session")
@@ -47,22 +47,40 @@ def run_folder() -> Path:
 
 @pytest.fixture(scope="session")
 def ready(bare_image: Image, kvm: bool, wheel: Path, run_folder: Path) -> State:  # noqa: FBT001 (a fixture)
-    """Return a guest that has booted, with the program and both services installed, but not started.
+    """Return a guest that has booted, with the program and both services installed, but not started."""
 
-    It is kept for the next run: with the same program, that one does not boot.
-    """
-    folder = CACHE / f"ready-{_content_hash(bare_image, kvm)}"
-    if not folder.exists():
-        for old in CACHE.glob("ready-*"):
-            shutil.rmtree(old)
-        with Guest(bare_image, run_folder / "first", kvm=kvm) as guest:
-            guest.start()
-            installation.install_program(guest, wheel)
-            installation.install_services(guest)
-            installation.start_far_ends(guest)
-            saved = guest.save(run_folder / "saved")
-        saved.folder.rename(folder)
-    return State(folder)
+    def prepare(guest: Guest) -> None:
+        guest.start()
+        installation.install_program(guest, wheel)
+        installation.install_services(guest)
+        installation.start_far_ends(guest)
+
+    return _saved("ready", bare_image, kvm, run_folder, prepare)
+
+
+@pytest.fixture(scope="session")
+def running(bare_image: Image, kvm: bool, ready: State, run_folder: Path) -> State:  # noqa: FBT001 (a fixture)
+    """Return a guest whose services have started; the instrument's adapter is not plugged in, as it cannot be saved."""
+
+    def prepare(guest: Guest) -> None:
+        guest.start(ready)
+        guest.output("systemctl enable --now tsgt-master tsgt-client", 120)
+        guest.wait("systemctl show -P StatusText tsgt-client | grep 'master . s ago'", 60)
+
+    return _saved("running", bare_image, kvm, run_folder, prepare)
+
+
+@pytest.fixture(scope="session")
+def streaming(bare_image: Image, kvm: bool, running: State, run_folder: Path) -> State:  # noqa: FBT001 (a fixture)
+    """Return a guest that measures, with the instrument behind a pseudo-terminal, so that all of it can be saved."""
+
+    def prepare(guest: Guest) -> None:
+        guest.start(running)
+        guest.push(installation.client_config(installation.PSEUDO_TERMINAL).encode(), "/etc/tsgt/client.toml")
+        guest.output("systemctl restart tsgt-client", 60)
+        installation.wait_for_measurements(guest)
+
+    return _saved("streaming", bare_image, kvm, run_folder, prepare)
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +97,44 @@ def guest(
         yield guest
 
 
+@pytest.fixture(scope="module")
+def measuring(
+    bare_image: Image,
+    kvm: bool,  # noqa: FBT001 (a fixture)
+    running: State,
+    run_folder: Path,
+    request: pytest.FixtureRequest,
+) -> Iterator[Guest]:
+    """Yield a guest whose client measures, and whose master records it; each file of tests has its own."""
+    with Guest(bare_image, run_folder / request.path.stem, kvm=kvm) as guest:
+        guest.start(running)
+        guest.plug_adapter()
+        installation.wait_for_measurements(guest)
+        yield guest
+
+
+def _saved(
+    name: str,
+    bare_image: Image,
+    kvm: bool,  # noqa: FBT001 (private)
+    run_folder: Path,
+    prepare: Callable[[Guest], None],
+) -> State:
+    """Return a guest as ``prepare`` leaves it, kept in the cache until the program changes."""
+    folder = CACHE / f"{name}-{_content_hash(bare_image, kvm)}"
+    if not folder.exists():
+        for old in CACHE.glob(f"{name}-*"):
+            shutil.rmtree(old)
+        with Guest(bare_image, run_folder / name, kvm=kvm) as guest:
+            prepare(guest)
+            saved = guest.save(run_folder / f"saved-{name}")
+        saved.folder.rename(folder)
+    return State(folder)
+
+
 def _content_hash(bare_image: Image, kvm: bool) -> str:  # noqa: FBT001 (private)
     content = hashlib.sha256(f"{bare_image.folder.name} {kvm}".encode())
-    names = ("guest.py", "installation.py", "conftest.py", "inside/far_ends.py")
+    names = ("installation.py", "inside/far_ends.py")
     here = [Path(__file__).parent / name for name in names]
     program = [*(ROOT / "tsgt").rglob("*"), *(ROOT / "configs").rglob("*")]
     for path in [*here, ROOT / "pyproject.toml", *sorted(program)]:

@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Self
 
+from vm.image import tool_environment
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -114,10 +116,17 @@ class Guest:
             self._process.wait()
             self._process = None
 
+    def shut_down(self, timeout_s: float = 30) -> None:
+        """Switch off in order."""
+        assert self._process is not None, "the guest does not run"
+        self.run("systemctl --no-block poweroff", timeout_s)
+        self._process.wait(30 + timeout_s * SLOWDOWN)
+        self.kill()
+
     def reboot(self) -> None:
         """Shut down and start again, in order."""
         before = self.output("cat /proc/sys/kernel/random/boot_id")
-        self.run("systemctl reboot", timeout_s=20)
+        self.run("systemctl --no-block reboot", timeout_s=20)
         deadline = time.monotonic() + BOOT_S * SLOWDOWN
         while time.monotonic() < deadline:
             self._expect_up(BOOT_S)
@@ -222,6 +231,7 @@ class Guest:
                 "node-name": "data",
                 "file": _file("data.img"),
                 "log": _file(str(write_log)),
+                "log-super-update-interval": 1,
             }
         speed = ["-accel", "kvm", "-cpu", "host"] if self._kvm else _FOLLOW_INSTRUCTIONS
         return [
@@ -287,9 +297,10 @@ class Guest:
 
     def _connect(self, name: str) -> _Lines:
         assert self._process is not None, "the guest does not run"
-        return _Lines(self.folder / name, self._check_runs)
+        return _Lines(self.folder / name, self.check_runs)
 
-    def _check_runs(self) -> None:
+    def check_runs(self) -> None:
+        """Raise GuestError if QEMU has ended."""
         if self._process is None or self._process.poll() is not None:
             raise GuestError(f"QEMU has ended: {(self.folder / 'qemu.log').read_text()[-2000:]}")
 
@@ -363,8 +374,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _call(*command: str) -> None:
-    environment = {**os.environ, "PATH": f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=tool_environment(), capture_output=True, text=True, check=False)
     if done.returncode:
         raise GuestError(f"{command[0]}: {done.stderr}")
 

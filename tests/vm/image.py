@@ -81,7 +81,9 @@ class Image:
 
 def missing_tools() -> str:
     """Return one line with what has to be installed, empty if nothing."""
-    packages = sorted({name for tool, name in TOOLS.items() if not shutil.which(tool, path=_path())})
+    packages = sorted(
+        {name for tool, name in TOOLS.items() if not shutil.which(tool, path=tool_environment()["PATH"])}
+    )
     return f"sudo apt install {' '.join(packages)}" if packages else ""
 
 
@@ -186,13 +188,13 @@ def _download_wheels(folder: Path) -> None:
 
 
 def _call(*command: str, cwd: Path | None = None) -> None:
-    environment = {**os.environ, "PATH": _path()}
     done = subprocess.run(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=cwd, check=False, env=environment
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=cwd, check=False, env=tool_environment()
     )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{command[0]} failed:\n{done.stdout.decode(errors='replace')[-3000:]}")
 
 
-def _path() -> str:
-    return f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+def tool_environment() -> dict[str, str]:
+    """Return an environment in which the tools of a file system are found by those who are not root."""
+    return {**os.environ, "PATH": f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -31,8 +32,12 @@ WantedBy=multi-user.target
 """
 
 
-def build_wheel(folder: Path) -> Path:
-    """Return a wheel of this source tree."""
+PSEUDO_TERMINAL = "/run/instrument.tty"
+"""A second instrument, behind no adapter."""
+
+
+def build_wheel(folder: Path, *, version: str | None = None) -> Path:
+    """Return a wheel of this source tree, perhaps with another version number."""
     with tempfile.TemporaryDirectory() as copy:
         for name in PACKAGE:
             source = ROOT / name
@@ -40,6 +45,9 @@ def build_wheel(folder: Path) -> Path:
                 shutil.copytree(source, Path(copy, name), ignore=shutil.ignore_patterns("__pycache__"))
             else:
                 shutil.copy(source, copy)
+        if version is not None:
+            face = Path(copy, "tsgt", "__init__.py")
+            face.write_text(re.sub(r'__version__ = ".*"', f'__version__ = "{version}"', face.read_text()))
         pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--disable-pip-version-check", "--no-deps"]
         subprocess.run([*pip, "--wheel-dir", folder, copy], check=True)
     (wheel,) = folder.glob("tsgt-*.whl")
@@ -88,16 +96,22 @@ def install_services(guest: Guest) -> None:
     guest.output("udevadm control --reload && udevadm trigger && systemctl daemon-reload")
 
 
-def client_config() -> str:
-    """Return the example's configuration of a client with the guest's adapter."""
-    return _changed("client.example.toml", {"port": f'"{ADAPTER_PORT}"'})
+def wait_for_measurements(guest: Guest, count: int = 3, timeout_s: float = 60) -> None:
+    """Wait until the master has recorded some further measurements."""
+    recorded = 'cat /var/lib/tsgt/master-*.jsonl | grep -c \'"type":"measurement"\''
+    before = int(guest.run(recorded).out)
+    guest.wait(f"[ $({recorded}) -ge {before + count} ]", timeout_s)
+
+
+def client_config(port: str = ADAPTER_PORT) -> str:
+    """Return the example's configuration of a client with a port of the guest."""
+    return _changed("client.example.toml", {"port": f'"{port}"'})
 
 
 def master_config() -> str:
-    """Return the example's configuration of a master at the second bus, with one station."""
+    """Return the example's configuration of a master at the second bus; of its three stations one exists."""
     text = _changed("master.example.toml", {"spi_bus": "1"})
-    text = text.replace("[radio.wiring]", '[radio.wiring]\ngpio_chip = "/dev/gpiochip1"')
-    return text[: text.index("[[stations]]\nstation = 2")]
+    return text.replace("[radio.wiring]", '[radio.wiring]\ngpio_chip = "/dev/gpiochip1"')
 
 
 def _changed(name: str, values: dict[str, str]) -> str:

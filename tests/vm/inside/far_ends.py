@@ -1,4 +1,4 @@
-"""Run in the guest: what is at the far ends of its wires. Two simulated radios on one channel, and a total station.
+"""Run in the guest: what is at the far ends of its wires. Two simulated radios on one channel, and total stations.
 
 Commands are lines written to the pipe ``/run/far_ends``:
 
@@ -25,7 +25,7 @@ import numpy as np
 
 from tsgt.config import ScenarioConfig
 from tsgt.config.scenario import MotionConfig
-from tsgt.simulation.instrument import SimulatedTotalStation
+from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation
 from tsgt.simulation.instrument.serial_line import Wire
 from tsgt.simulation.kernel import LoopTimeline
 from tsgt.simulation.lora import Air, LinkModel, LogDistanceLoss, SX1276Chip
@@ -39,6 +39,7 @@ COMMANDS = Path("/run/far_ends")
 STATE = Path("/run/far_ends.json")
 REPORT = "/dev/virtio-ports/report"
 ADAPTER = "/dev/virtio-ports/adapter"
+TERMINAL = Path("/run/instrument.tty")
 
 PLACES = {"client": (0.0, 0.0, 0.0), "master": (50.0, 0.0, 0.0)}
 """Of the radios 0 and 1, in m."""
@@ -189,12 +190,12 @@ async def main() -> None:
 
     scenario = ScenarioConfig(motion=MotionConfig(speeds_mps=(0.0,), speed_weights=(1.0,)))
     world = scenario_world(scenario, WORLD_S, np.random.default_rng(3))
-    station = scenario.stations[0]
-    instrument = SimulatedTotalStation(
-        station, scenario, world, timeline, np.random.default_rng(4), start_ns=timeline.now_ns()
-    )
-    Line(instrument, timeline)
 
+    def instrument() -> SimulatedTotalStation:
+        rng, now_ns = np.random.default_rng(4), timeline.now_ns()
+        return SimulatedTotalStation(scenario.stations[0], scenario, world, timeline, rng, start_ns=now_ns)
+
+    Line(instrument(), timeline)
     os.mkfifo(COMMANDS)
     commands = os.open(COMMANDS, os.O_RDWR | os.O_NONBLOCK)  # open for writing as well: it never ends
 
@@ -203,8 +204,10 @@ async def main() -> None:
             obey(line, radios)
 
     loop.add_reader(commands, read_commands)
-    print("ready", flush=True)  # noqa: T201
-    await asyncio.Event().wait()
+    async with PtyLine(instrument(), TERMINAL):
+        os.chmod(TERMINAL, 0o666)  # noqa: PTH101, S103 (no waiting; the service is another user)
+        print("ready", flush=True)  # noqa: T201
+        await asyncio.Event().wait()
 
 
 if __name__ == "__main__":

@@ -22,9 +22,9 @@ def test_written_configurations_are_legal(
 ) -> None:
     """The rehearsal names a region, as a configuration for outside has to; the demonstration transmits nothing."""
     files = write_demo_files(tmp_path, scenario, tmp_path / "poses.sock", region=region)
-    master = load(files.master_config, MasterConfig)
-    clients = [load(files.client_config(number), ClientConfig) for number in files.stations]
-    for config in (master, *clients):
+    configs: list[ClientConfig | MasterConfig] = [load(files.master_config, MasterConfig)]
+    configs += [load(files.client_config(number), ClientConfig) for number in files.stations]
+    for config in configs:
         assert config.radio.region == region
         found = legality(config, files.master_config)
         assert (found.violations, found.warning) == ((), None)

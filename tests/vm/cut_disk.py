@@ -47,10 +47,10 @@ def examine(disk: Path, folder: Path) -> Remains:
             continue
         if path.name.startswith("master"):
             measurements = load_recording(path, on_problem=problems.append).measurements
-            recorded.update(m.sequence % SEQUENCES for m in measurements if m.sequence is not None)
+            recorded.update(m.sequence % SEQUENCES for m in measurements)
         else:
             journal = load_journal(path, on_problem=problems.append)
-            journalled.update(m.sequence % SEQUENCES for m in journal.measurements if m.sequence is not None)
+            journalled.update(m.sequence % SEQUENCES for m in journal.measurements)
         assert len(problems) <= 1, problems
     return Remains(recorded, journalled, zero_bytes)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import cast, get_args
 
+import pytest
 from harness.damage import examples
 from harness.radios import MS, PAPER
 from hypothesis import given
@@ -147,6 +148,7 @@ def test_every_transaction_ends(turn: str, answers: list[list[tuple[bytes, int]]
                 subject.timed_out()
 
 
+@pytest.mark.slow
 @examples(300)
 @given(data=st.data(), cycles=st.integers(1, 12))
 def test_late_and_lost_packets_never_make_a_wrong_sample(data: st.DataObject, cycles: int) -> None:

@@ -100,6 +100,7 @@ def test_commands_with_a_damaged_recording(
     assert damage != UNDAMAGED or outcome.code in (0, 3), outcome
 
 
+@pytest.mark.slow
 @examples(2)
 @given(of=st.integers(0, 1), recording_damage=damages, journal_damage=damages, keep_going=st.booleans())
 def test_merge_of_damaged_journals(

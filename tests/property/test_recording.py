@@ -20,6 +20,7 @@ BEGINNING = len(recording_bytes())
 LINES_BEFORE = [WHOLE[:end].count(b"\n") for end in range(len(WHOLE) + 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beginning", [True, False], ids=["header and parameters", "rest"])
 def test_truncation_loses_one_line_at_most(tmp_path: Path, *, beginning: bool) -> None:
     """Truncation loses one line at most."""

@@ -47,6 +47,7 @@ def measurements(folder: Path) -> list[PolarMeasurement]:
     return load_journal(path).measurements
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [2.5, 20.0])
 async def test_offered_distance_is_journalled_once(tmp_path: Path, rate_hz: float) -> None:
     """With the instrument's time, the arrival of the reply, and a timestamp between measurement and arrival."""

@@ -293,6 +293,7 @@ def test_messages_equal_the_goldens() -> None:
 names = st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=9)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**31 * 1_000_000_000 - 1), names, names)
 def test_frame_names_and_times_are_decoded_exactly(at: int, frame: str, child: str) -> None:
     """Any time before 2038, and frame names of any length between the numbers."""

@@ -35,6 +35,7 @@ def recording(drive: UncalibratedDrive, tmp_path_factory: pytest.TempPathFactory
     return path
 
 
+@pytest.mark.slow
 def test_file_and_json_hold_the_mounting(
     tsgt: Tsgt, drive: UncalibratedDrive, recording: Path, tmp_path: Path
 ) -> None:
@@ -131,6 +132,7 @@ def test_two_prisms_do_not_calibrate(tsgt: Tsgt, recording: Path, tmp_path: Path
     )
 
 
+@pytest.mark.slow
 def test_imported_samples_are_calibrated(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
     """Of a recording that knows no IMU; class and gravity go into the file, which then describes the IMU completely."""
     lines = recording.read_bytes().splitlines(keepends=True)

@@ -270,6 +270,7 @@ def test_odometry_defines_the_stationary_intervals(tmp_path: Path) -> None:
     assert found["inter_prism_static_mm"]["1-2"]["valid"] == 10
 
 
+@pytest.mark.slow
 def test_odometry_of_another_day_is_not_used(tmp_path: Path) -> None:
     """The report says that it does not cover the drive."""
     other_day = (1_600_000_000_000_000_000, 1_600_000_100_000_000_000)

@@ -45,6 +45,7 @@ def test_json_has_the_documented_keys(tsgt: Tsgt) -> None:
     assert found["wall_seconds"] > 0
 
 
+@pytest.mark.slow
 def test_json_has_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
     """Frames, send queues, missed slots and outages."""
     outcome = tsgt(

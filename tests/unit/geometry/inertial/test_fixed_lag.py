@@ -238,6 +238,7 @@ def test_backlog_and_an_outage_at_once() -> None:
         assert np.abs(knots_s - time_s).min() <= 0.0101
 
 
+@pytest.mark.slow
 def test_no_wrong_start_after_a_tripod_has_tilted() -> None:
     """Two prisms agree with a wrong rotation, but the gyro carries the right one on."""
     observations = measurements(2)

@@ -182,6 +182,7 @@ def test_right_setup_is_not_reported(grade: str) -> None:
     assert check.confirmed
 
 
+@pytest.mark.slow
 def test_one_prism_alone_is_not_another_robot() -> None:
     """When the robot drives where one station alone sees it, the stations do not tell its rates there."""
     check = drive(alone_from_s=42.0).check()

@@ -111,6 +111,7 @@ def test_prisms_are_refined_only_on_request(prisms: bool) -> None:  # noqa: FBT0
     assert distances == pytest.approx(true, abs=1.5e-3)
 
 
+@pytest.mark.slow
 def test_another_layout_is_no_refinement() -> None:
     """Decimetres are a gross error: the set-up stays, so that the residuals show it."""
     observations = drive(30.0)

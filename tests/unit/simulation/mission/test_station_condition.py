@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import pytest
 from harness.missions import SUPERFRAME, run_mission
 from harness.records import START
 from harness.web import feed, mission, pose
@@ -24,6 +25,7 @@ async def low_battery_and_other_air(mission: Mission) -> None:
     mission.instruments[3].settings.atmospheric_ppm = 41.3
 
 
+@pytest.mark.slow
 def test_condition_reaches_status_event_terminal_and_page(tmp_path: Path) -> None:
     """Through driver, client, radio and master; a low battery is one event."""
     run_mission(tmp_path, duration_s=8.0, script=low_battery_and_other_air, protocol=SUPERFRAME)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vm.image import Image
 
 CUTS = 20
-PACKETS_OF_LOG = 60
+PACKETS_OF_LOG = 100
 
 
 def packets(report: Path, start: int = 0) -> int:
@@ -55,7 +55,7 @@ def test_machine_ends(
         report = guest.folder / "report.log"
         report.unlink(missing_ok=True)
         guest.start(streaming)
-        wait_for_packets(guest, report, generator.randint(5, 12))
+        wait_for_packets(guest, report, generator.randint(10, 30))
         time.sleep(generator.uniform(0, 1))
         guest.kill()
     expected = acknowledged(report)

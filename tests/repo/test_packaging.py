@@ -52,11 +52,20 @@ def test_removal_leaves_configuration_and_recordings(installed: Path) -> None:
     assert names(installed) == ["etc/tsgt/client.toml", "opt/other/file", "var/lib/tsgt/station1.jsonl"]
 
 
-def test_purge_removes_them(installed: Path) -> None:
-    """Of tsgt nothing is left."""
+def test_purge_leaves_recordings_alone(installed: Path) -> None:
+    """They cannot be made again."""
+    call("prerm", "remove", root=installed)
+    call("postrm", "purge", root=installed)
+    assert names(installed) == ["opt/other/file", "var/lib/tsgt/station1.jsonl"]
+
+
+def test_purge_leaves_nothing_without_recordings(installed: Path) -> None:
+    """Not even their folder."""
+    (installed / "var/lib/tsgt/station1.jsonl").unlink()
     call("prerm", "remove", root=installed)
     call("postrm", "purge", root=installed)
     assert names(installed) == ["opt/other/file"]
+    assert not (installed / "var/lib/tsgt").exists()
 
 
 def test_upgrade_leaves_all_until_the_new_environment_is_ready(installed: Path) -> None:

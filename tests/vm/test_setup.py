@@ -111,11 +111,12 @@ def test_second_run_changes_nothing(installed: Guest) -> None:
 
 
 def test_removal_leaves_configuration_and_recordings(installed: Guest) -> None:
-    """And purging leaves nothing."""
+    """And purging leaves the recordings."""
     installed.output("systemctl stop far-ends; dpkg --remove tsgt", 120)
     assert installed.run("systemctl is-active tsgt-master tsgt-client").code != 0
     assert installed.output("ls /etc/tsgt").split() == ["client.toml", "master.toml", "radio.key"]
     assert installed.output("ls /var/lib/tsgt/*.jsonl")
     assert installed.run("test -e /opt/tsgt -o -e /usr/bin/tsgt").code == 1
     installed.output("dpkg --purge tsgt")
-    assert installed.run("ls -d /etc/tsgt /var/lib/tsgt").code != 0
+    assert installed.run("ls -d /etc/tsgt").code != 0
+    assert installed.output("ls /var/lib/tsgt/*.jsonl")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vm.image import Image
 
 CUTS = 20
-PACKETS_OF_LOG = 100
+PACKETS_OF_LOG = 60
 
 
 def packets(report: Path, start: int = 0) -> int:

@@ -58,27 +58,32 @@ async def test_master_has_the_imu_of_the_robot(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-async def test_program_prints_the_lines_of_the_socket(tmp_path: Path) -> None:
-    """Those from when it is started on, as often as it is."""
+def test_program_prints_the_lines_of_the_socket(tmp_path: Path) -> None:
+    """Those from when it is started on, as often as it is; in real time, because the program is a process."""
+    asyncio.run(_lines_of_the_socket(tmp_path / "imu.sock"))
+
+
+async def _lines_of_the_socket(path: Path) -> None:
     clock = SystemClock()
     start_s = clock.monotonic_ns() / 1e9
     world = scenario_world(ScenarioConfig(), 20.0, np.random.default_rng(0))
     run = simulate_imu(SimulatedImu(model="industrial"), world.motion_at, 15.0, seed=[0])
     samples = replace(run.samples, arrival_s=run.samples.arrival_s + start_s)
     program = ImuProgram(IMU_MODELS["industrial"], samples, clock)
-    path = tmp_path / "imu.sock"
     async with ImuServer(path, program, clock):
         for _ in range(2):
             process = await asyncio.create_subprocess_exec(*imu_command(path), stdout=asyncio.subprocess.PIPE)
-            assert process.stdout is not None
-            hello, first = await process.stdout.readline(), await process.stdout.readline()
-            assert isinstance(decode_program_line(hello), HelloLine)
-            line = decode_program_line(first)
-            assert isinstance(line, SamplesLine)
-            assert line.host_time_ns is not None
-            assert clock.monotonic_ns() - line.host_time_ns[-1] >= 0
-            process.terminate()
-            await process.wait()
+            try:
+                assert process.stdout is not None
+                hello, first = await process.stdout.readline(), await process.stdout.readline()
+                assert isinstance(decode_program_line(hello), HelloLine)
+                line = decode_program_line(first)
+                assert isinstance(line, SamplesLine)
+                assert line.host_time_ns is not None
+                assert clock.monotonic_ns() >= line.host_time_ns[-1]
+            finally:
+                process.terminate()
+                await process.wait()
 
 
 @pytest.mark.parametrize("protocol", ["superframe", "classic"])

@@ -11,7 +11,16 @@ import asyncio
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
+
+from tsgt.errors import ComputerSuspendedError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_SUSPENDED_TOLERANCE_NS = (
+    5_000_000  # more than the time between readings of two clocks, less than any suspension
+)
 
 
 class Clock(Protocol):
@@ -52,6 +61,37 @@ def boot_id() -> str:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError):
         return ""
+
+
+def suspended_ns() -> int:
+    """Return for how long this computer has been suspended since it was started; meanwhile CLOCK_MONOTONIC stood still."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):  # not Linux
+        return 0
+    # A reading may be interrupted; the shortest one was not.
+    return min(-time.monotonic_ns() + time.clock_gettime_ns(time.CLOCK_BOOTTIME) for _ in range(3))
+
+
+class SuspensionWatch:
+    """Notices that the computer was suspended: times of CLOCK_MONOTONIC from before do not compare with later ones.
+
+    ``suspended_ns``: see :func:`suspended_ns`.
+    """
+
+    def __init__(self, suspended_ns: Callable[[], int]) -> None:
+        self._suspended_ns = suspended_ns
+        self._before_ns = suspended_ns()
+
+    def boot(self, boot: str) -> str:
+        """Return the identity of CLOCK_MONOTONIC's origin: of the boot, and of the suspensions since then; empty where unknown."""
+        if not boot or self._before_ns < _SUSPENDED_TOLERANCE_NS:
+            return boot
+        return f"{boot}+{round(self._before_ns / 1e7)}"
+
+    def check(self) -> None:
+        """Raise ComputerSuspendedError if the computer was suspended since this watch began."""
+        suspended_ns = self._suspended_ns() - self._before_ns
+        if suspended_ns > _SUSPENDED_TOLERANCE_NS:
+            raise ComputerSuspendedError(suspended_ns / 1e9)
 
 
 @dataclass(frozen=True, slots=True)

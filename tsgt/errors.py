@@ -14,6 +14,7 @@
     │   └── DegenerateGeometryError  coincident or collinear points
     ├── StreamError            a socket cannot be opened or reached
     ├── MessageError           invalid message of a radio protocol
+    ├── ComputerSuspendedError  the computer was suspended, its clock stood still
     ├── InstrumentError        the total station failed to execute a command, or is not reachable
     │   └── InstrumentRefusedError  it cannot execute this command: no licence or no target
     └── RadioError             the radio failed
@@ -106,6 +107,16 @@ class StreamError(TsgtError, OSError):
 
 class MessageError(TsgtError, ValueError):
     """Bytes that do not form a valid message, or a message with values that do not fit its fields."""
+
+
+class ComputerSuspendedError(TsgtError):
+    """The computer was suspended: CLOCK_MONOTONIC stood still for ``for_s``."""
+
+    def __init__(self, for_s: float) -> None:
+        super().__init__(
+            f"this computer was suspended for {for_s:.1f} s; keep it from sleeping during a mission"
+        )
+        self.for_s = for_s
 
 
 class InstrumentError(TsgtError):

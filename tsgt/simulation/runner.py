@@ -23,7 +23,7 @@ from tsgt.simulation.faults import (
     relock_instruments,
 )
 from tsgt.simulation.kernel import VirtualTimeline, run_virtual
-from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult, has_odometry
+from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult, Slew, has_odometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -118,6 +118,11 @@ def simulate(
             superframe=isinstance(options.protocol, SuperframeMasterConfig),
             outages=options.outages,
             faults=Counter(fault.kind for fault in faults),
+            slews=tuple(
+                Slew(fault.station, fault.at_s, fault.at_s + fault.duration_s)
+                for fault in faults
+                if fault.kind == FaultKind.NTP_SLEW and fault.station is not None
+            ),
             knocks_s=tuple(fault.at_s for fault in faults if fault.kind == FaultKind.IMU_KNOCK),
             faults_end_s=options.duration_s - FAULT_FREE_TAIL_S if faults else None,
             rate_hz={station.station: station.rate_hz for station in scenario.stations},

@@ -12,8 +12,8 @@ import structlog
 
 import tsgt
 from tsgt import service
-from tsgt.clock import UnixTimeline
-from tsgt.errors import RecordingError
+from tsgt.clock import SuspensionWatch, UnixTimeline
+from tsgt.errors import ComputerSuspendedError, RecordingError
 from tsgt.radio import Command, MeasureCommand
 from tsgt.radio.superframe import UNKNOWN_CONDITION, InstrumentCondition, InstrumentState
 from tsgt.radio.supervisor import supervise_radio
@@ -51,6 +51,32 @@ async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies:
     Instrument, radio and disk may fail and recover; the other parts continue meanwhile. Raises RecordingError if the
     journal cannot be created: missing folder, no permission. Raises StreamError if the control socket cannot be
     created: another client serves it.
+    """
+    while True:
+        watch = SuspensionWatch(dependencies.suspended_ns)
+        try:
+            await _run_until_suspended(
+                config, settings, replace(dependencies, boot=watch.boot(dependencies.boot)), watch
+            )
+        except* ComputerSuspendedError as errors:
+            log.warning("computer_resumed", for_s=round(_first(errors).for_s, 3))
+
+
+def _first(errors: BaseExceptionGroup[ComputerSuspendedError]) -> ComputerSuspendedError:
+    error: BaseException = errors
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    if not isinstance(error, ComputerSuspendedError):
+        raise TypeError(f"expected ComputerSuspendedError, got {error!r}")
+    return error
+
+
+async def _run_until_suspended(
+    config: ClientConfig, settings: LoRaSettings, dependencies: ClientDependencies, watch: SuspensionWatch
+) -> None:
+    """Run until cancelled. Raises ComputerSuspendedError after a resume: nothing then compares with times from before.
+
+    All that is known of the clocks is made anew, as after a reboot; the backlog is in the journal.
     """
     clock, random_bits = dependencies.clock, dependencies.random_bits
     timeline = UnixTimeline.fixed_now(clock)
@@ -98,7 +124,16 @@ async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies:
             with ControlSocket(config.status_socket) as control_socket:
                 async with asyncio.TaskGroup() as group:
                     client = _StationClient(
-                        config, settings, dependencies, timeline, recorder, journal, path, backlog, group
+                        config,
+                        settings,
+                        dependencies,
+                        watch,
+                        timeline,
+                        recorder,
+                        journal,
+                        path,
+                        backlog,
+                        group,
                     )
                     log.info("client_started", station=config.station, journal=str(path))
                     group.create_task(journal.run())
@@ -122,6 +157,7 @@ class _StationClient:
         config: ClientConfig,
         settings: LoRaSettings,
         dependencies: ClientDependencies,
+        watch: SuspensionWatch,
         timeline: UnixTimeline,
         recorder: Recorder,
         journal: JournalQueue,
@@ -130,6 +166,7 @@ class _StationClient:
         group: asyncio.TaskGroup,
     ) -> None:
         self._clock = dependencies.clock
+        self._watch = watch
         self._timeline = timeline
         self._recorder = recorder
         self._journal = journal
@@ -158,6 +195,7 @@ class _StationClient:
                 config.station,
                 settings,
                 dependencies,
+                watch,
                 timeline,
                 backlog,
                 stream_id=backlog.stream_id,
@@ -170,6 +208,7 @@ class _StationClient:
     # --- Instrument -------------------------------------------------------------------------------------------
 
     def _on_reading(self, reading: Reading) -> None:
+        self._watch.check()
         measurement = self._session.measurement(reading, self._timeline.unix_ns(reading.at_ns))
         self._journal.write(measurement, partial(self._link.offer, measurement))
 

@@ -6,6 +6,8 @@ import secrets
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tsgt.clock import suspended_ns
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -29,6 +31,8 @@ class ClientDependencies:
     boot
         Identifies the start of this computer from which ``clock`` counts; empty where unknown: no other run is then
         assumed to share the clock.
+    suspended_ns
+        Returns for how long this computer has been suspended since that start.
     write
         See :class:`~tsgt.recording.RecordingWriter`.
     """
@@ -39,4 +43,5 @@ class ClientDependencies:
     key: bytes | None = None
     random_bits: Callable[[int], int] = secrets.randbits
     boot: str = ""
+    suspended_ns: Callable[[], int] = suspended_ns
     write: Callable[[int, memoryview], int] | None = None

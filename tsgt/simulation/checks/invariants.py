@@ -6,6 +6,7 @@ Each check uses its own path to the data: journals are read from disk, poses are
 from __future__ import annotations
 
 import math
+from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,10 +20,11 @@ from tsgt.simulation.checks.imu_samples import imu_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.odometry_samples import odometry_failures
 from tsgt.simulation.checks.pose_consistency import pose_failures
+from tsgt.simulation.faults import NTP_SLEW_PPM
 from tsgt.simulation.mission import JournalIndex
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.model import PolarMeasurement
@@ -42,6 +44,8 @@ _MAX_TIMESTAMP_ERROR_NS = 40_000_000
 # Limit of the median over at least this number; the median of a whole mission is within 1 ms.
 _MIN_TIMESTAMPS = 40
 _MAX_MEDIAN_ERROR_NS = 5_000_000
+# Longer than any outage of the radio that a fault causes.
+_SLEW_SHOWS_S = 30.0
 
 
 class Violation(NamedTuple):
@@ -76,7 +80,9 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
             )
     for master_log in result.master_logs:
         found += duplicate_deliveries(master_log)
-        found += timestamp_violations(master_log, indices, start_ns=master_log.unix_at_zero_ns)
+        found += timestamp_violations(
+            master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)
+        )
         found += (Violation("pose", what) for what in pose_failures(master_log, result))
         if replay:
             found += replay_mismatches(master_log)
@@ -223,9 +229,13 @@ def duplicate_deliveries(master_log: MasterLog) -> Iterator[Violation]:
 
 
 def timestamp_violations(
-    master_log: MasterLog, indices: Mapping[int, JournalIndex], *, start_ns: int
+    master_log: MasterLog,
+    indices: Mapping[int, JournalIndex],
+    *,
+    start_ns: int,
+    slewed_ns: Callable[[int, int], float] = lambda _station, _true_ns: 0.0,
 ) -> Iterator[Violation]:
-    """Compare timestamp errors with the stated bounds."""
+    """Compare timestamp errors with the stated bounds; ``slewed_ns``: by station and true time, see :func:`_slewed_ns`."""
     for measurement in master_log.measurements:
         if measurement.stamp_sigma_ns >= UNTIMED_SIGMA_NS and not usable(measurement):
             continue  # a failed measurement without a time states none
@@ -245,12 +255,25 @@ def timestamp_violations(
             yield Violation(
                 "time", f"station {measurement.station}: delivered without a timestamp bound: {measurement}"
             )
-        elif abs(error_ns) > bound_ns + _ROUNDING_NS:
+        elif abs(error_ns) > bound_ns + _ROUNDING_NS + slewed_ns(measurement.station, true_ns):
             yield Violation(
                 "time",
                 f"station {measurement.station} at {(measurement.stamp_ns - start_ns) / 1e9:.3f} s: timestamp error "
                 f"{error_ns / 1e3:.0f} us, bound {bound_ns / 1e3:.0f} us",
             )
+
+
+def _slewed_ns(result: MissionResult, station: int, true_ns: int) -> float:
+    """Return by how much NTP has slewed a station's clock around a true time: no bound holds until that shows.
+
+    It shows at the second beacon after the change, or over ``classic`` at the next synchronisation.
+    """
+    shows_s = _SLEW_SHOWS_S if result.superframe else math.inf
+    return sum(
+        1e3 * NTP_SLEW_PPM * (slew.to_s - slew.from_s)
+        for slew in result.slews
+        if slew.station == station and slew.from_s - shows_s <= true_ns / 1e9 <= slew.to_s + shows_s
+    )
 
 
 def replay_mismatches(master_log: MasterLog) -> Iterator[Violation]:

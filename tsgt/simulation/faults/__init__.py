@@ -8,6 +8,7 @@ from tsgt.simulation.faults.catalogue import (
     FAST_SYNC_CYCLES,
     FAULT_FREE_START_S,
     FAULT_FREE_TAIL_S,
+    FIELD_DAY_FAULTS,
     IMU_FAULTS,
     ODOMETRY_FAULTS,
     Fault,
@@ -15,6 +16,7 @@ from tsgt.simulation.faults.catalogue import (
     draw_faults,
     parse_faults,
 )
+from tsgt.simulation.faults.computers import NTP_SLEW_PPM
 from tsgt.simulation.faults.imu_conditions import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD, imu_conditions
 from tsgt.simulation.faults.injection import inject_fault, relock_instruments
 from tsgt.simulation.faults.odometry_conditions import odometry_conditions
@@ -23,9 +25,11 @@ __all__ = [
     "FAST_SYNC_CYCLES",
     "FAULT_FREE_START_S",
     "FAULT_FREE_TAIL_S",
+    "FIELD_DAY_FAULTS",
     "IMU_FAULTS",
     "KNOCK_DISPLACEMENT_M",
     "KNOCK_ROTATION_RAD",
+    "NTP_SLEW_PPM",
     "ODOMETRY_FAULTS",
     "Fault",
     "FaultKind",

@@ -106,8 +106,17 @@ class FaultKind(StrEnum):
     ODOMETRY_SLIP = "odometry-slip"
     """The wheels spin, slide or are locked: the measured speed is 0 to 2.5 times the true one."""
 
+    SLOW_DISK = "slow-disk"
+    """Writes and syncs take 0.2 to 6 s again and again, as on an SD card that tidies up."""
+    SUSPEND = "suspend"
+    """A station's computer is suspended and resumed: its clocks and programs stand still, the Unix clock runs on."""
+    NTP_BOOT_STEP = "ntp-boot-step"
+    """A station's computer reboots, and NTP sets its Unix clock, which stood still for the time without power, some seconds later."""
+    NTP_SLEW = "ntp-slew"
+    """NTP slews a station's clock by 500 ppm, CLOCK_MONOTONIC as well."""
 
-# Further kinds come last: the draws of the others stay the same.
+
+# Further kinds come last: the draws of the others stay the same. Kinds from SLOW_DISK on have a generator each.
 
 
 class _FaultRate(NamedTuple):
@@ -155,6 +164,10 @@ _RATES: Final = {
     FaultKind.ODOMETRY_SILENCE: _FaultRate(10, _O, (0.1, 30)),
     FaultKind.ODOMETRY_STUCK: _FaultRate(10, _O, (0.1, 30)),
     FaultKind.ODOMETRY_SLIP: _FaultRate(20, _O, (0.3, 20)),
+    FaultKind.SLOW_DISK: _FaultRate(8, _B, (2, 40)),
+    FaultKind.SUSPEND: _FaultRate(4, _S, (0.05, 30)),
+    FaultKind.NTP_BOOT_STEP: _FaultRate(2, _S, (1, 20)),
+    FaultKind.NTP_SLEW: _FaultRate(4, _S, (2, 40)),
 }
 
 RATE_FACTOR = 3.0
@@ -179,8 +192,12 @@ ODOMETRY_FAULTS: Final = frozenset(kind for kind, rate in _RATES.items() if rate
 """Kinds of faults that only a robot with wheel odometry has."""
 
 
+FIELD_DAY_FAULTS: Final = frozenset({FaultKind.NTP_SLEW})
+"""Kinds that are injected by name only: what they violate is bounded, or they need a mission of their own."""
+
+
 def parse_faults(text: str) -> frozenset[FaultKind]:
-    """Parse kinds of faults: ``none``, ``all``, or comma-separated names.
+    """Parse kinds of faults: ``none``, ``all`` (without :data:`FIELD_DAY_FAULTS`), or comma-separated names.
 
     Raises
     ------
@@ -188,7 +205,7 @@ def parse_faults(text: str) -> frozenset[FaultKind]:
         Unknown name.
     """
     if text in {"none", "all"}:
-        return frozenset(FaultKind if text == "all" else ())
+        return frozenset(FaultKind) - FIELD_DAY_FAULTS if text == "all" else frozenset()
     names = text.split(",")
     for name in names:
         if name not in set(FaultKind):
@@ -214,7 +231,11 @@ def draw_faults(
     ordered = sorted(set(kinds) - impossible, key=list(FaultKind).index)
     end_s = duration_s - FAULT_FREE_TAIL_S
     faults = []
+    own = list(FaultKind)[list(FaultKind).index(FaultKind.SLOW_DISK) :]
+    generators = dict(zip(own, rng.spawn(len(own)), strict=True))
+    common = rng
     for kind in ordered:
+        rng = generators.get(kind, common)
         factor, omitted = _RATE_SPREAD ** rng.uniform(-1, 1), rng.random() < _OMIT_PROBABILITY
         rate = _RATES[kind]
         for station in [

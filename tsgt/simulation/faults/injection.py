@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tsgt.simulation.faults.catalogue import RELOCK_DELAY_S, FaultKind
+from tsgt.simulation.faults.computers import COMPUTER_INJECTORS
 from tsgt.simulation.instrument import LineFault, Lock
 from tsgt.simulation.kernel import DriftingClock
 from tsgt.simulation.lora.adversary import MAX_NOISE_BYTES, ReplayAttacker
@@ -339,4 +340,5 @@ _INJECTORS: Final[Mapping[FaultKind, Callable[[Mission, Fault, np.random.Generat
     FaultKind.DISK_READ_ONLY: partial(_disk, errno.EROFS),
     FaultKind.SLOW_READER: _slow_reader,
     FaultKind.VANISHING_READER: _vanishing_reader,
+    **COMPUTER_INJECTORS,
 }

@@ -5,7 +5,7 @@ In: callbacks at times, a coroutine to run. Out: the same execution order on eve
 """
 
 from tsgt.simulation.kernel.clocks import DriftingClock, SimulatedClock, VirtualClock, drift_ramp
-from tsgt.simulation.kernel.event_loop import run_virtual
+from tsgt.simulation.kernel.event_loop import VirtualEventLoop, run_virtual
 from tsgt.simulation.kernel.timeline import Handle, LoopTimeline, Timeline, VirtualTimeline
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "SimulatedClock",
     "Timeline",
     "VirtualClock",
+    "VirtualEventLoop",
     "VirtualTimeline",
     "drift_ramp",
     "run_virtual",

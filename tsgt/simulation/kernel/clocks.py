@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from tsgt.clock import Clock
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
 
 class SimulatedClock(Clock, Protocol):
@@ -84,6 +84,7 @@ class DriftingClock:
     ) -> None:
         self._true = true
         self._offset_ns = offset_ns
+        self._resumes_with_ppm: float | None = None  # None: not suspended
         steps = sorted(drift_changes)
         self._segments = [
             _RateSegment(
@@ -114,8 +115,24 @@ class DriftingClock:
 
     def change_drift(self, by_ppm: float) -> None:
         """Increase the frequency offset by ``by_ppm`` from now on."""
+        if self._resumes_with_ppm is not None:
+            self._resumes_with_ppm += by_ppm
+            return
         now_ns, ppm = self._true.monotonic_ns(), self._segments[-1].ppm + by_ppm
         self._segments.append(_RateSegment(now_ns, self.local_ns(now_ns), ppm))
+
+    def suspend(self) -> Callable[[], None]:
+        """Stop CLOCK_MONOTONIC, as the suspension of a computer does; return what lets it run on. The Unix clock is kept by hardware."""
+        suspended_ns, self._resumes_with_ppm = self._true.monotonic_ns(), self._segments[-1].ppm
+        self._segments.append(_RateSegment(suspended_ns, self.local_ns(suspended_ns), _SUSPENDED_PPM))
+
+        def resume() -> None:
+            resumed_ns = self._true.monotonic_ns()
+            ppm, self._resumes_with_ppm = self._resumes_with_ppm or 0.0, None
+            self._segments.append(_RateSegment(resumed_ns, self.local_ns(resumed_ns) + 1, ppm))
+            self.step(resumed_ns - suspended_ns)
+
+        return resume
 
     def local_ns(self, true_ns: int) -> int:
         """Return the reading of CLOCK_MONOTONIC at a true time, both in ns."""
@@ -134,6 +151,8 @@ class DriftingClock:
             index = bisect_right(self._segments, local_ns, key=itemgetter(1)) - 1
             segment = self._segments[max(0, index)]
         elapsed_ns = local_ns - segment.local_ns
+        if segment.ppm == _SUSPENDED_PPM:
+            return segment.true_ns + elapsed_ns * 1_000_000
         gained_ns = elapsed_ns * segment.ppm * 1e-6 / (1 + segment.ppm * 1e-6)
         true_ns = segment.true_ns + elapsed_ns - round(gained_ns)
         while self.local_ns(true_ns) >= local_ns:
@@ -142,6 +161,8 @@ class DriftingClock:
             true_ns += 1
         return true_ns
 
+
+_SUSPENDED_PPM = -999_999.0  # a microsecond per second: a clock that stands still has no inverse
 
 RAMP_HALF_PERIOD_NS = 600 * 10**9
 """A drift ramp rises for this time, then falls for as long: a computer that warms up and cools down."""

@@ -20,6 +20,7 @@ import os
 import selectors
 import socket
 import stat
+from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple, Unpack
 
@@ -57,6 +58,8 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
         self._timeline = timeline
         self._isolated = isolated
         self._running_in_executor = 0
+        self._running_inline = False
+        self._suspended: list[_Suspension] = []
         selector = _TimeJumpSelector(timeline, time_frozen=lambda: self._running_in_executor > 0)
         super().__init__(selector)
         selector.attach(self._ready, isolated=isolated)  # type: ignore[attr-defined]  # BaseEventLoop's, unknown to typeshed
@@ -95,13 +98,72 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
     def _run_inline(self, func: Callable[[Unpack[Ts]], T], *args: *Ts) -> asyncio.Future[T]:
         """Run executor work now; the result is set in the next round, as with a thread."""
         future: asyncio.Future[T] = self.create_future()
+        self._try_inline(future, func, *args)
+        return future
+
+    def _try_inline(self, future: asyncio.Future[T], func: Callable[[Unpack[Ts]], T], *args: *Ts) -> None:
+        if future.done():  # cancelled while it was blocked
+            return
+        self._running_inline = True
         try:
             result = func(*args)
+        except _BlockedError as blocked:
+            self.call_at(blocked.until_s, self._try_inline, future, func, *args)
         except Exception as error:  # noqa: BLE001 (passed on to the caller)
             self.call_soon(_set_if_pending, future, future.set_exception, error)
         else:
             self.call_soon(_set_if_pending, future, future.set_result, result)
-        return future
+        finally:
+            self._running_inline = False
+
+    def block_executor_work(self, until_ns: int) -> None:
+        """Block the executor work of an isolated loop that calls this, until a time; no effect for other callers.
+
+        The work is abandoned and started again then: it must be able to continue where it was, as a write of queued lines is.
+        """
+        if self._running_inline and until_ns > self._timeline.now_ns():
+            raise _BlockedError(until_ns / 1e9)
+
+    def suspend(self, belongs: Callable[[Context], bool]) -> Callable[[], None]:
+        """Hold back the callbacks of some contexts, as on a computer that is suspended; return what lets them run."""
+        suspension = _Suspension(belongs)
+        self._suspended.append(suspension)
+        self._hold_callbacks()
+
+        def resume() -> None:
+            self._suspended.remove(suspension)
+            self._hold_callbacks()
+            for handle in suspension.held:
+                self._add_callback(handle)  # type: ignore[attr-defined]  # as in _due
+
+        return resume
+
+    def _hold_callbacks(self) -> None:
+        """Look at each callback while some are held; at other times this costs nothing."""
+        if self._suspended:
+            self.call_soon = self._call_soon_or_hold  # type: ignore[method-assign]
+            self._add_callback = self._add_or_hold
+        else:
+            vars(self).pop("call_soon", None)
+            vars(self).pop("_add_callback", None)
+
+    def _call_soon_or_hold(
+        self, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.Handle:
+        context = copy_context() if context is None else context
+        for suspension in self._suspended:
+            if suspension.belongs(context):
+                handle = asyncio.Handle(callback, args, self, context)
+                suspension.held.append(handle)
+                return handle
+        return super().call_soon(callback, *args, context=context)
+
+    def _add_or_hold(self, handle: asyncio.Handle) -> None:
+        for suspension in self._suspended:
+            if suspension.belongs(handle._context):  # type: ignore[attr-defined]  # noqa: SLF001 (asyncio's own)
+                suspension.held.append(handle)
+                return
+        super()._add_callback(handle)  # type: ignore[misc]  # as in _due
 
     def _executor_done(self, _: asyncio.Future[Any]) -> None:
         self._running_in_executor -= 1
@@ -111,6 +173,22 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
         self._running_in_executor += 1
         await super().shutdown_default_executor()
         self._running_in_executor -= 1
+
+
+class _BlockedError(BaseException):
+    """Executor work is blocked; not an Exception, so that it is not handled as an error of a disk."""
+
+    def __init__(self, until_s: float) -> None:
+        super().__init__(until_s)
+        self.until_s = until_s
+
+
+class _Suspension:
+    """Callbacks that are held back."""
+
+    def __init__(self, belongs: Callable[[Context], bool]) -> None:
+        self.belongs = belongs
+        self.held: list[asyncio.Handle] = []
 
 
 def _set_if_pending(future: asyncio.Future[Any], set_outcome: Callable[[Any], None], outcome: object) -> None:

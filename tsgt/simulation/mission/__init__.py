@@ -7,7 +7,14 @@ the ground truth. `Mission` also starts, stops, kills and reboots computers for 
 from tsgt.simulation.mission.computer import MASTER
 from tsgt.simulation.mission.daemon_configs import has_odometry, instrument_config, station_name
 from tsgt.simulation.mission.mission import DRAIN_S, Mission
-from tsgt.simulation.mission.run_log import JournalIndex, MasterLog, MissionResult, StationLog, ValidPoses
+from tsgt.simulation.mission.run_log import (
+    JournalIndex,
+    MasterLog,
+    MissionResult,
+    Slew,
+    StationLog,
+    ValidPoses,
+)
 
 __all__ = [
     "DRAIN_S",
@@ -16,6 +23,7 @@ __all__ = [
     "MasterLog",
     "Mission",
     "MissionResult",
+    "Slew",
     "StationLog",
     "ValidPoses",
     "has_odometry",

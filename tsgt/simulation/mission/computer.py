@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from contextvars import ContextVar, copy_context
 from typing import TYPE_CHECKING
 
+from tsgt.simulation.kernel import DriftingClock, VirtualEventLoop
 from tsgt.simulation.lora import HostDelay, radio_opener
 from tsgt.simulation.mission.disk import DiskWriter, ProcessKilled, SimulatedDisk
 
@@ -14,11 +16,14 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.radio import LoRaSettings, RadioOpener
-    from tsgt.simulation.kernel import DriftingClock, VirtualClock
+    from tsgt.simulation.kernel import VirtualClock
     from tsgt.simulation.lora import Air, RadioHardware, TimestampJitter
 
 MASTER = "master"
 """Name of the master's computer."""
+
+_RUNS_ON: ContextVar[str] = ContextVar("_RUNS_ON")
+"""Name of the computer on which a task runs."""
 
 
 class Computer:
@@ -38,6 +43,8 @@ class Computer:
         self.rng = rng
         self.disk = SimulatedDisk()
         self.task: asyncio.Task[None] | None = None  # the running daemon; None: there is none
+        self.suspended_ns = 0  # for how long it has been suspended since it was switched on
+        self.is_suspended = False
         self.is_down = False  # whether the daemon was ended by the simulation and will be restarted
         self.hardware: RadioHardware | None = None  # radio hardware, since it was last opened
         self.disk_writer: DiskWriter | None = None  # disk access of the current or last daemon
@@ -62,14 +69,33 @@ class Computer:
     def _opened(self, hardware: RadioHardware) -> None:
         self.hardware = hardware
 
-    def new_writer(self) -> Callable[[int, memoryview], int]:
-        """Return the write function of the next daemon."""
+    def new_writer(self) -> DiskWriter:
+        """Return the disk access of the next daemon."""
         self.disk_writer = DiskWriter(self.disk)
-        return self.disk_writer.write
+        return self.disk_writer
 
     def start(self, daemon: Coroutine[None, None, None]) -> None:
         """Start a daemon."""
-        self.task = asyncio.create_task(daemon, name=self.name)
+        context = copy_context()
+        context.run(_RUNS_ON.set, self.name)
+        self.task = asyncio.create_task(daemon, name=self.name, context=context)
+
+    def suspend(self) -> Callable[[], None]:
+        """Suspend the computer: its programs and its clock stand still; return what resumes it."""
+        loop = asyncio.get_running_loop()
+        if not isinstance(loop, VirtualEventLoop) or not isinstance(self.clock, DriftingClock):
+            raise TypeError(f"{self.name}: only a station on virtual time can be suspended")
+        resume_programs = loop.suspend(lambda context: context.get(_RUNS_ON) == self.name)
+        self.is_suspended = True
+        resume_clock, since_ns = self.clock.suspend(), self._air.timeline.now_ns()
+
+        def resume() -> None:
+            self.is_suspended = False
+            resume_clock()
+            self.suspended_ns += self._air.timeline.now_ns() - since_ns
+            resume_programs()
+
+        return resume
 
     async def stop(self) -> None:
         """Cancel the daemon, as systemd's stop does, and wait for its end; no effect without one.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tsgt.recording import DiskStatus
+from tsgt.simulation.kernel import VirtualEventLoop
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,6 +26,7 @@ class SimulatedDisk:
     """State of a disk, shared by all daemons that run on a computer."""
 
     write_error: int | None = None  # error number of all writes, ENOSPC or EROFS; None: writes succeed
+    stalled_until_ns: int = 0  # true time until which writes and syncs in a thread wait
     _failure_ns: tuple[int, int] | None = None
 
     def status(self) -> DiskStatus:
@@ -34,9 +37,22 @@ class SimulatedDisk:
 
     def fail_writes(self, error: int, since_ns: int, until_ns: int) -> None:
         """Fail all writes with an error. The end time only informs :meth:`failing_since_ns`; reset ``write_error`` to end."""
+        self.write_error = error
+        self._note_failure(since_ns, until_ns)
+
+    def stall(self, since_ns: int, until_ns: int) -> None:
+        """Delay writes and syncs, as the housekeeping of an SD card does; true times in ns."""
+        self.stalled_until_ns = max(self.stalled_until_ns, until_ns)
+        self._note_failure(since_ns, until_ns)
+
+    def wait(self) -> None:
+        """Wait for the end of a stall, if called in the executor of a virtual event loop."""
+        if self.stalled_until_ns and isinstance(loop := asyncio.get_running_loop(), VirtualEventLoop):
+            loop.block_executor_work(self.stalled_until_ns)
+
+    def _note_failure(self, since_ns: int, until_ns: int) -> None:
         if self._failure_ns is not None and since_ns <= self._failure_ns[1] + WRITE_RECOVERY_NS:
             since_ns, until_ns = self._failure_ns[0], max(until_ns, self._failure_ns[1])
-        self.write_error = error
         self._failure_ns = (since_ns, until_ns)
 
     def failing_since_ns(self, now_ns: int) -> int:
@@ -74,6 +90,7 @@ class DiskWriter:
         """
         if self._killed:
             raise ProcessKilled
+        self._disk.wait()
         if self._disk.write_error == errno.ENOSPC and len(data) > 1:
             return os.write(fd, data[: len(data) // 2])
         if self._disk.write_error is not None:
@@ -86,6 +103,10 @@ class DiskWriter:
             then()
             raise ProcessKilled
         return os.write(fd, data)
+
+    def sync(self, _fd: int) -> None:
+        """Do nothing, after a stall: a simulated power failure loses nothing that was written."""
+        self._disk.wait()
 
     def tear_next_write(self, share: float, then: Callable[[], object]) -> None:
         """Kill the daemon during its next write, of which a share (0 to 1) reaches the disk, and call ``then`` in that thread."""

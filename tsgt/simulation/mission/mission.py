@@ -67,6 +67,33 @@ _SHAKING_SEED = 0x5A
 _YEAR_NS = 365 * 86_400 * 10**9
 
 
+class _ClientClock:
+    """The clock that a client is given, with what the client knows of it, who reads the Unix time once per run.
+
+    Attributes
+    ----------
+    unix_at_zero_ns
+        Unix time at monotonic zero.
+    suspended_ns
+        For how long the computer had been suspended.
+    """
+
+    def __init__(self, computer: Computer) -> None:
+        self._computer, self._clock = computer, (clock := computer.clock)
+        self.monotonic_ns, self.sleep_until, self.true_ns = (
+            clock.monotonic_ns,
+            clock.sleep_until,
+            clock.true_ns,
+        )
+        self.unix_at_zero_ns = self.suspended_ns = 0
+
+    def realtime_ns(self) -> int:
+        realtime_ns = self._clock.realtime_ns()
+        self.unix_at_zero_ns = realtime_ns - self._clock.monotonic_ns()
+        self.suspended_ns = self._computer.suspended_ns
+        return realtime_ns
+
+
 class Mission:
     """A mission; create and use it in a running event loop on virtual time. Dictionaries are keyed by station number.
 
@@ -247,6 +274,7 @@ class Mission:
             start_odometry = OdometryProgram(self.odometry, self.clock).start
         folder.mkdir()
         computer = self.computers[MASTER]
+        writer = computer.new_writer()
         computer.start(
             run_master(
                 config,
@@ -260,8 +288,8 @@ class Mission:
                     observe=master_log.observe,
                     start_imu=start_imu,
                     start_odometry=start_odometry,
-                    write=computer.new_writer(),
-                    sync=lambda _file: None,  # a simulated power failure loses nothing that was written
+                    write=writer.write,
+                    sync=writer.sync,
                     disk_status=lambda _folder: computer.disk.status(),
                     start_check=start_now,  # no other thread: it would break on a look at all objects
                 ),
@@ -293,14 +321,16 @@ class Mission:
     def _client(self, entry: SimulatedStation) -> Coroutine[None, None, None]:
         station = entry.station
         station_log, computer = self.station_logs[station], self._computer(station)
-        clock = computer.clock
+        clock = _ClientClock(computer)
         folder = self._folder / station_name(station)
         folder.mkdir(exist_ok=True)
-        unix_at_zero_ns = clock.realtime_ns() - clock.monotonic_ns()
 
         def on_reading(reading: Reading) -> None:
-            station_log.true_times_ns[unix_at_zero_ns + reading.at_ns] = clock.true_ns(reading.at_ns)
-            station_log.read_times_ns[unix_at_zero_ns + reading.at_ns] = self._true.monotonic_ns()
+            if computer.suspended_ns != clock.suspended_ns:
+                return  # the client starts anew instead of using the reading: its time mixes two clocks
+            host_time_ns = clock.unix_at_zero_ns + reading.at_ns
+            station_log.true_times_ns[host_time_ns] = clock.true_ns(reading.at_ns)
+            station_log.read_times_ns[host_time_ns] = self._true.monotonic_ns()
 
         return run_client(
             client_config(self._scenario, entry, self._options, folder),
@@ -312,7 +342,8 @@ class Mission:
                 key=self._key,
                 random_bits=self._random_bits,
                 boot=f"{station_name(station)}-{self._boots[station]}",
-                write=computer.new_writer(),
+                suspended_ns=lambda: computer.suspended_ns,
+                write=computer.new_writer().write,
             ),
         )
 
@@ -361,6 +392,18 @@ class Mission:
         station_log = self.station_logs[self._station(computer.name)]
         station_log.crash_windows_ns.append((computer.disk.failing_since_ns(now_ns), now_ns))
 
+    async def suspend(self, station: int, for_s: float) -> None:
+        """Suspend a station's computer, whose instrument's responses are lost meanwhile; no effect on one that is down."""
+        computer, line = self._computer(station), self.lines[station]
+        if computer.is_down or computer.is_suspended:
+            return
+        line.faults.drop_responses = True
+        resume = computer.suspend()
+        await asyncio.sleep(for_s)
+        line.faults.drop_responses = False
+        self._record_crash_window(computer)
+        resume()
+
     async def _record_status(self, name: str) -> None:
         """Record a client's status before it ends; the authors' node has none."""
         for station_log in self.station_logs.values():
@@ -402,6 +445,7 @@ class Mission:
         computer.clock = self._station_clock(station, offset_ns=unix_ns - START_UNIX_NS, booted_ns=now_ns)
         self.lines[station] = self._line(station)
         self._boots[station] += 1
+        computer.suspended_ns = 0
         self.start_station(station)
 
     def stream_socket(self) -> Path:

@@ -6,7 +6,7 @@ from array import array
 from collections import Counter
 from dataclasses import dataclass, field, fields
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -307,6 +307,14 @@ class ObservedInstrument(LeicaInstrument):
         return reading
 
 
+class Slew(NamedTuple):
+    """NTP has changed the frequency of a station's clock for some time; times in s from the start."""
+
+    station: int
+    from_s: float
+    to_s: float
+
+
 @dataclass(frozen=True, slots=True)
 class MissionResult:
     """A completed mission."""
@@ -320,6 +328,7 @@ class MissionResult:
     superframe: bool
     outages: tuple[Outage, ...] = ()
     faults: Counter[FaultKind] = field(default_factory=Counter)  # number of faults by kind
+    slews: tuple[Slew, ...] = ()  # of the stations' clocks by NTP
     knocks_s: tuple[float, ...] = ()  # when the IMU was knocked, in s from the start
     faults_end_s: float | None = None  # end of the faults in s from the start; None: no faults
     rate_hz: dict[int, float] = field(default_factory=dict)  # measurement rate by station number

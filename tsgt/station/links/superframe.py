@@ -17,7 +17,7 @@ from tsgt.station.status import LinkStatus
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tsgt.clock import UnixTimeline
+    from tsgt.clock import SuspensionWatch, UnixTimeline
     from tsgt.model import PolarMeasurement
     from tsgt.radio import Command, DirectCommand, LoRaSettings, Radio, SearchCommand, TrackCommand
     from tsgt.radio.superframe import InstrumentState, ReceivedBeacon
@@ -39,6 +39,8 @@ class SuperframeLink:
 
     Parameters
     ----------
+    watch
+        Checked before the times of a beacon and of a reply are used.
     backlog
         Measurements and receptions of earlier runs.
     instrument_state
@@ -54,6 +56,7 @@ class SuperframeLink:
         station: int,
         settings: LoRaSettings,
         dependencies: ClientDependencies,
+        watch: SuspensionWatch,
         timeline: UnixTimeline,
         backlog: Backlog,
         *,
@@ -64,6 +67,7 @@ class SuperframeLink:
     ) -> None:
         self._clock = clock = dependencies.clock
         self._timeline = timeline
+        self._watch = watch
         self._boot = dependencies.boot
         self._authenticator = Authenticator(dependencies.key)
         self._send_queue = SendQueue(backlog.first_sequence, backlog.queued)
@@ -114,9 +118,10 @@ class SuperframeLink:
         self._submit_next()
 
     async def run(self, radio: Radio) -> NoReturn:
-        """Reply to each beacon in the station's slot."""
+        """Reply to each beacon in the station's slot. Raises ComputerSuspendedError after a suspension, RadioError."""
         while True:
             packet = await radio.receive()
+            self._watch.check()
             failures = self._station.authentication_failures
             beacon = self._station.received(packet)
             self._traffic_monitor.received(from_master=beacon is not None)
@@ -133,6 +138,7 @@ class SuperframeLink:
     async def _reply(self, radio: Radio, slot_ns: int) -> None:
         missed_slots = self._station.missed_slots
         await self._clock.sleep_until(slot_ns - REPLY_LEAD_NS)
+        self._watch.check()
         reply = self._station.compose(self._instrument_state(), self._clock.monotonic_ns())
         if reply is not None:
             self._station.sent(await radio.transmit(reply, at_ns=slot_ns))

@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 import time
+from contextvars import ContextVar, copy_context
 from typing import TYPE_CHECKING
 
 import pytest
@@ -347,3 +348,54 @@ def test_timers_of_a_closed_loop_have_no_effect() -> None:
     loop.close()
     timeline.advance(2_000_000_000)
     assert run_virtual(lambda: asyncio.sleep(1, "later"), timeline) == "later"
+
+
+def test_blocked_executor_work_continues_later() -> None:
+    """It waits in virtual time, while other tasks run, and then starts again; elsewhere the call has no effect."""
+    timeline = VirtualTimeline()
+    done: list[str] = []
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualEventLoop)
+        loop.block_executor_work(HOUR_NS)  # not in the executor
+
+        def write() -> None:
+            loop.block_executor_work(HOUR_NS)
+            done.append("written")
+
+        writing = asyncio.create_task(asyncio.to_thread(write))
+        await asyncio.sleep(60)
+        done.append("a minute")
+        await writing
+
+    run_virtual(main, timeline, isolated=True)
+    assert done == ["a minute", "written"]
+    assert timeline.now_ns() == HOUR_NS
+
+
+def test_suspended_tasks_stand_still() -> None:
+    """Those of one context, their timers and wake-ups included; on resumption they run in their order."""
+    suspended: ContextVar[bool] = ContextVar("suspended")
+    ticks: list[float] = []
+
+    async def tick(loop: asyncio.AbstractEventLoop) -> None:
+        while True:
+            await asyncio.sleep(1.0)
+            ticks.append(loop.time())
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualEventLoop)
+        context = copy_context()
+        context.run(suspended.set, True)
+        ticking = asyncio.create_task(tick(loop), context=context)
+        await asyncio.sleep(2.5)
+        resume = loop.suspend(lambda context: context.get(suspended, False))
+        await asyncio.sleep(10.0)
+        resume()
+        await asyncio.sleep(2.0)
+        ticking.cancel()
+
+    run_virtual(main, isolated=True)
+    assert ticks == [1.0, 2.0, 12.5, 13.5]

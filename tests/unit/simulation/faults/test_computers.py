@@ -1,0 +1,64 @@
+"""Faults of computers in the field: slow disks, suspension, NTP."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from harness.missions import SUPERFRAME, run_mission
+
+from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.faults import FIELD_DAY_FAULTS, FaultKind, parse_faults
+from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.config import ScenarioConfig
+    from tsgt.simulation.mission import Mission
+
+
+def _linear() -> ScenarioConfig:
+    scenario = find_scenario("dynamic")
+    return scenario.model_copy(
+        update={"pipeline": scenario.pipeline.model_copy(update={"estimator": "linear"})}
+    )
+
+
+def test_kinds_of_field_days_come_by_name_only() -> None:
+    """What needs a mission of its own is not among all."""
+    assert not FIELD_DAY_FAULTS & parse_faults("all")
+    assert parse_faults("ntp-slew") == {FaultKind.NTP_SLEW}
+
+
+@pytest.mark.slow
+def test_measurements_around_a_suspension_have_their_true_times(tmp_path: Path) -> None:
+    """With 8 s the offset of the clock jumps by 122 times 2^16 us and 4.6 ms, which beacons without the full time do not tell."""
+
+    async def suspend(mission: Mission) -> None:
+        await mission.sleep_until(12.0)
+        await mission.suspend(2, 8.0)
+
+    result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=32.0)
+    assert check_invariants(result, replay=False) == []
+    late = [m for m in result.master_logs[-1].measurements if m.station == 2 and m.received_ns is not None]
+    assert sum((m.stamp_ns - result.start_ns) / 1e9 > 21.0 for m in late) > 15
+
+
+@pytest.mark.slow
+def test_measurements_wait_for_a_stalled_disk(tmp_path: Path) -> None:
+    """No station's queue gets shorter while the master's disk stalls, and nothing is lost."""
+    queued: list[int] = []
+
+    async def stall(mission: Mission) -> None:
+        await mission.sleep_until(10.0)
+        mission.computers["master"].disk.stall(10_000_000_000, 16_000_000_000)
+        await mission.sleep_until(15.9)
+        for station in (1, 2, 3):
+            await mission.stop(f"station{station}")
+            queued.append(mission.station_logs[station].statuses[-1].queued or 0)
+            mission.start_station(station)
+
+    result = run_mission(tmp_path, _linear(), script=stall, protocol=SUPERFRAME, duration_s=24.0)
+    assert check_invariants(result) == []
+    assert min(queued) >= 12

@@ -37,8 +37,8 @@ class BorderedCholesky:
         """Covariances of the states, (K, B, B), and of each with the next one, (K - 1, B, B)."""
         diagonal, off_diagonal = self.states.marginals()
         spread = self.solved_border @ self.shared_covariance
-        diagonal += spread @ np.swapaxes(self.solved_border, 1, 2)
-        off_diagonal += spread[:-1] @ np.swapaxes(self.solved_border[1:], 1, 2)
+        diagonal += spread @ self.solved_border.swapaxes(1, 2)
+        off_diagonal += spread[:-1] @ self.solved_border[1:].swapaxes(1, 2)
         return diagonal, off_diagonal
 
     def last_covariance(self) -> FloatArray:

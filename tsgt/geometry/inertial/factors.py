@@ -218,12 +218,12 @@ def assemble_inertial(
         later = slice(chunk.start + 1, chunk.stop + 1)
         some, steps = knots.select(slice(chunk.start, later.stop)), factors.select(chunk)
         rows = linearise_inertial(some, gravity, steps)
-        normal = np.swapaxes(rows, 1, 2) @ rows
+        normal = rows.swapaxes(1, 2) @ rows
         cost += float(normal[:, residual, residual].sum())
         if steps.odometry is not None:
             rows = linearise_odometry(some, steps.odometry, shared_dim=shared)
             odometry_weights, odometry_loss = robust_loss(dot(rows[:, :, residual], rows[:, :, residual]))
-            normal += np.swapaxes(rows * odometry_weights[:, None, None], 1, 2) @ rows
+            normal += (rows * odometry_weights[:, None, None]).swapaxes(1, 2) @ rows
             cost += float(odometry_loss.sum())
         diagonal[chunk] += normal[:, earlier_part, earlier_part]
         diagonal[later] += normal[:, later_part, later_part]
@@ -283,12 +283,12 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
         force = found.mean_force()
         bias = bias + gravity.force_error(force)
     position, rotation, velocity = found.corrected(earlier.gyro_bias, bias)
-    R_T = np.swapaxes(earlier.rotation, 1, 2)
+    R_T = earlier.rotation.swapaxes(1, 2)
     turned = R_T @ later.rotation
-    residual = fast_log_so3(np.swapaxes(rotation, 1, 2) @ turned)
+    residual = fast_log_so3(rotation.swapaxes(1, 2) @ turned)
     J_r_inv = inverse_right_jacobian(residual)
     by_rotation = np.zeros((len(found), 3, column + 1))
-    by_rotation[:, :, 3:6] = -J_r_inv @ np.swapaxes(turned, 1, 2)
+    by_rotation[:, :, 3:6] = -J_r_inv @ turned.swapaxes(1, 2)
     # The correction by the bias is applied to the preintegrated rotation on its right.
     correction = exp_so3(-residual)
     by_rotation[:, :, 9:12] = -J_r_inv @ correction @ found.by_gyro_bias[:, 3:6]
@@ -330,7 +330,7 @@ def _motion_rows(
     """(K - 1, 9, 2 D + S + 1) whitened rows of the motion prior on position, velocity and acceleration, axis by axis."""
     assert factors.motion is not None  # noqa: S101 (only called without an accelerometer)
     phi, information = factors.motion
-    roots = np.swapaxes(np.linalg.cholesky(information), 2, 3)
+    roots = (np.linalg.cholesky(information)).swapaxes(2, 3)
     size = earlier.dim
     rows = np.zeros((len(phi), 9, 2 * size + shared + 1))
     for axis in range(3):

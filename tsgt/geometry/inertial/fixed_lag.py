@@ -221,7 +221,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
                 # The first of two of the same interval.
                 joined = joined.select(order[np.diff(joined.end_s[order], prepend=-np.inf) > 0])
             # The gap before the first of them ends there.
-            previous = int(np.searchsorted(joined.end_s, new.end_s[0])) - 1
+            previous = int(joined.end_s.searchsorted(new.end_s[0])) - 1
             from_s = min(from_s, float(joined.end_s[previous]) if previous >= 0 else -np.inf)
         self._samples = joined
         self._stale_from_s = min(self._stale_from_s, from_s)
@@ -234,7 +234,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             return
         joined = self._odometry.samples.joined(new)
         self._odometry = replace(self._odometry, samples=joined)
-        previous = int(np.searchsorted(joined.end_s, new.end_s[0])) - 1
+        previous = int(joined.end_s.searchsorted(new.end_s[0])) - 1
         from_s = float(joined.end_s[previous]) if previous >= 0 else -np.inf
         self._stale_from_s = min(self._stale_from_s, from_s)
         if self._predictor is not None:
@@ -256,7 +256,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if self._samples is not None:
             # A trajectory that is lost still predicts.
             from_s = before_s if self._predictor is None else min(before_s, self._predictor.time_s)
-            first = int(np.searchsorted(self._samples.end_s, from_s - SAMPLES_MARGIN_S))
+            first = int(self._samples.end_s.searchsorted(from_s - SAMPLES_MARGIN_S))
             # The last one, however old: missing ones are filled in from there.
             self._samples = self._samples.select(slice(max(min(first, len(self._samples) - 1), 0), None))
             if self._odometry is not None:
@@ -351,7 +351,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Return the samples from the first knot to the last; a knot alone needs some too."""
         assert self._samples is not None  # noqa: S101 (there are knots)
         start_s, end_s = float(knots_s[0]), float(knots_s[-1])
-        first, stop = np.searchsorted(self._samples.end_s, (start_s, end_s))
+        first, stop = self._samples.end_s.searchsorted((start_s, end_s))
         # One more at each end: where the first one begins, and what comes after the last knot.
         some = self._samples.select(slice(max(int(first) - 1, 0), int(stop) + 1))
         return contiguous(some, self._noise, start_s=start_s, end_s=end_s)
@@ -550,11 +550,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
             if np.abs(times_s - each).min() > 0.5 * MIN_KNOT_SPACING_S:
                 times_s = np.sort(np.append(times_s, each))
         if added and times_s[-1] - old_s[-1] > MAX_KNOT_SPACING_S:
-            newest = int(np.searchsorted(times_s, old_s[-1]))
+            newest = int(times_s.searchsorted(old_s[-1]))
             times_s = np.concatenate([times_s[:newest], _divided(times_s[newest:])])
         samples = self._contiguous(times_s)
         # The states of the knots before; those of new ones are propagated below.
-        nearest = np.searchsorted(old_s, times_s, side="right") - 1
+        nearest = old_s.searchsorted(times_s, side="right") - 1
         guess = replace(knots.select(nearest), time_s=times_s)
         factors = self._factors_of(window, guess, samples)
         for row in np.flatnonzero(old_s[nearest] != times_s).tolist():
@@ -569,7 +569,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
     ) -> InertialFactors:
         """Factors between knots: those of the window where neither knots nor samples nor the gyro's bias have changed."""
         old, old_s, times_s = window.factors, window.knots.time_s, knots.time_s
-        row = np.searchsorted(old_s, times_s[:-1])
+        row = old_s.searchsorted(times_s[:-1])
         row[row >= len(old)] = 0
         kept = np.zeros(len(times_s) - 1, np.bool_)
         if len(old):
@@ -631,7 +631,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         assert self._window is not None  # noqa: S101 (converged)
         assert self.observations is not None  # noqa: S101 (converged)
         knots_s = self._window.knots.time_s
-        first = int(np.searchsorted(knots_s, before_s, side="right")) - 1
+        first = int(knots_s.searchsorted(before_s, side="right")) - 1
         if first <= 0:
             return
         knot_index = nearest_knots(knots_s, self.observations.time_s)

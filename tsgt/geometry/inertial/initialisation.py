@@ -105,7 +105,7 @@ def states_on_tracks(
         rows = observations.prism == prism
         measured_s = observations.time_s[rows]
         track = np.stack([np.interp(time_s, measured_s, each) for each in points[rows].T], axis=1)
-        after = np.clip(np.searchsorted(measured_s, time_s), 1, max(len(measured_s) - 1, 1))
+        after = np.clip(measured_s.searchsorted(time_s), 1, max(len(measured_s) - 1, 1))
         nearest_s = np.minimum(
             np.abs(time_s - measured_s[after - 1]),
             np.abs(time_s - measured_s[np.minimum(after, len(measured_s) - 1)]),

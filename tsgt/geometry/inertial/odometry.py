@@ -178,7 +178,7 @@ class Odometry:
         variances[:, 1] += parameters.turning_sigma_m**2 * (whole @ self.axes[:, 2]) ** 2 / duration_s
         variances[:, 2] = parameters.vertical_sigma_mps**2 * duration_s
         axes = exp_so3(0.5 * whole) @ self.axes
-        whitening = np.swapaxes(axes / np.sqrt(variances)[:, None, :], 1, 2)
+        whitening = (axes / np.sqrt(variances)[:, None, :]).swapaxes(1, 2)
         whitening[~known] = 0.0
         kept, gained = np.ones((2, len(start_s), WHEELS_DIM))
         kept[:, 1] = np.exp(-duration_s / parameters.slip_correlation_time_s)
@@ -206,8 +206,8 @@ class Odometry:
             touching = between_s < _TOUCHING * samples.duration_s[1:]
             begins_s = begins_s.copy()
             begins_s[1:][touching] = ends_s[:-1][touching]
-        first = np.searchsorted(ends_s, start_s, side="right")
-        count = np.maximum(np.searchsorted(begins_s, end_s) - first, 0)
+        first = ends_s.searchsorted(start_s, side="right")
+        count = np.maximum(begins_s.searchsorted(end_s) - first, 0)
         step = np.repeat(np.arange(len(start_s)), count)
         row = np.arange(len(step)) - np.repeat(np.cumsum(count) - count, count) + first[step]
         begin_s, stop_s = np.maximum(begins_s[row], start_s[step]), np.minimum(ends_s[row], end_s[step])
@@ -262,7 +262,7 @@ def linearise_odometry(knots: InertialStates, steps: OdometrySteps, *, shared_di
     """Whitened rows of the K - 1 steps between knots, (K - 1, 3, 2 D + S + 1): in columns as those of the other factors."""
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
     size = knots.dim
-    R_T = np.swapaxes(earlier.rotation, 1, 2)
+    R_T = earlier.rotation.swapaxes(1, 2)
     turned = R_T @ later.rotation
     # Of the wheels' point, in the axes at the start.
     end = matvec(R_T, later.position - earlier.position) + matvec(turned, steps.arm_m)

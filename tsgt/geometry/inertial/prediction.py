@@ -18,7 +18,7 @@ from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import strapdown
 from tsgt.geometry.inertial.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, concatenate_inertial_states
-from tsgt.geometry.rigid import IDENTITY, FloatArray, matvec, skew
+from tsgt.geometry.rigid import IDENTITY, FloatArray, cross, matvec, skew
 from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
 from tsgt.geometry.trajectory.motion_prior import process_noise, transition
 from tsgt.geometry.trajectory.propagation import Propagator
@@ -103,7 +103,7 @@ class StrapdownPredictor:
         size = newest.state.dim
         part = slice(INERTIAL_STATE_DIM, size)
         from_s = newest.time_s - duration_s
-        first = int(np.searchsorted(knots.time_s[:-1], from_s))
+        first = int(knots.time_s[:-1].searchsorted(from_s))
         last, covered = knots.select(slice(first, None)), steps.select(slice(first, None))
         known = covered_steps(covered)
         rejected = rejected_steps(last, covered)
@@ -168,8 +168,8 @@ class StrapdownPredictor:
         self, link: _Link, end_s: float, samples: InertialSamples, odometry: Odometry | None
     ) -> _Link:
         """Predict from one state to a later time, by samples up to then at least."""
-        first = int(np.searchsorted(samples.end_s, link.time_s, side="right"))
-        stop = int(np.searchsorted(samples.end_s, end_s)) + 1
+        first = int(samples.end_s.searchsorted(link.time_s, side="right"))
+        stop = int(samples.end_s.searchsorted(end_s)) + 1
         # The sample before tells where the first one begins.
         some = samples.select(slice(max(first - 1, 0), stop))
         present = contiguous(some, self._noise, start_s=link.time_s, end_s=end_s)
@@ -248,7 +248,7 @@ class StrapdownPredictor:
         by_start[6:9, tilt_part] = step_s * by_tilt
         if gravity.matrix.size:
             by_bias = found.by_start[:, :, 12:15]
-            by_start[0:9, tilt_part.stop :] = gravity.by_matrix(by_bias, motion.mean_force())[0]
+            by_start[0:9, tilt_part.stop :] = gravity.by_matrix(by_bias, found.force)[0]
         noise[0:9, 0:9] = found.noise[0]
         moved = replace(state, position=found.position, rotation=found.rotation, velocity=found.velocity)
         return moved, by_start, noise
@@ -305,11 +305,11 @@ class StrapdownPredictor:
         if onward_s > 0:
             rate, force = (each.mean(axis=0) for each in _newest(samples))
         else:
-            row = min(int(np.searchsorted(samples.end_s, state.time_s[0] - 1e-9)), len(samples) - 1)
+            row = min(int(samples.end_s.searchsorted(state.time_s[0] - 1e-9)), len(samples) - 1)
             rate, force = samples.angular_rate_radps[row], samples.specific_force_mps2[row]
         rate = rate - state.gyro_bias[0] if turning is None else turning.rate
         rotation, arm = state.rotation[0], self._mounting.in_imu(np.zeros(3))
-        circular = np.cross(rate, arm)
+        circular = cross(rate, arm)
         if self._gyro_only:
             acceleration = state.bias_or_acceleration[0]
         else:
@@ -330,7 +330,7 @@ class StrapdownPredictor:
             state.rotation @ to_robot.T,
             state.velocity + matvec(rotation, circular),
             (to_robot @ rate)[None],
-            (acceleration + matvec(rotation, np.cross(rate, circular)))[None],
+            (acceleration + matvec(rotation, cross(rate, circular)))[None],
             np.zeros((1, 3)),
         )
         return found, by_error
@@ -364,5 +364,5 @@ class StrapdownPredictor:
 
 def _newest(samples: InertialSamples) -> tuple[FloatArray, FloatArray]:
     """Rates and forces, (N, 3) each, of the last samples."""
-    first = int(np.searchsorted(samples.end_s, samples.end_s[-1] - TREND_SPAN_S + 1e-9))
+    first = int(samples.end_s.searchsorted(samples.end_s[-1] - TREND_SPAN_S + 1e-9))
     return samples.angular_rate_radps[first:], samples.specific_force_mps2[first:]

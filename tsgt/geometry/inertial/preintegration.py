@@ -8,7 +8,7 @@ the product of the rotations. docs/explanation/imu.md derives the sums.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -30,6 +30,7 @@ GAP_SPECIFIC_FORCE_SIGMA_MPS2 = 2.0
 _MAX_GAP_SHARE = (
     0.5  # Of a sample's duration: a sample that begins later than this after the one before leaves a gap
 )
+_ROWS_PER_SCAN = 4  # Samples per interval from which fewer and larger products of rotations are faster
 _PARTS_PER_CHUNK = 4096  # Samples that are integrated in one pass; their matrices stay in the cache
 
 
@@ -49,16 +50,16 @@ class ContiguousSamples:
 
     def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Angular rate and specific force at M instants, (M, 3) each: linear between the middles of the samples."""
-        inside = np.clip(np.searchsorted(self.bounds_s, time_s) - 1, 0, len(self) - 1)
+        inside = np.minimum(np.maximum(self.bounds_s.searchsorted(time_s) - 1, 0), len(self) - 1)
         # Not of all samples: few times are asked for at once.
         after_middle = 0.5 * (self.bounds_s[inside] + self.bounds_s[inside + 1]) < time_s
-        later = np.clip(inside + after_middle, 1, max(len(self) - 1, 1))
+        later = np.minimum(np.maximum(inside + after_middle, 1), max(len(self) - 1, 1))
         earlier, later = later - 1, np.minimum(later, len(self) - 1)
         earlier_s, later_s = (
             0.5 * (self.bounds_s[rows] + self.bounds_s[rows + 1]) for rows in (earlier, later)
         )
         step_s = np.where(later > earlier, later_s - earlier_s, 1.0)
-        share = np.clip((time_s - earlier_s) / step_s, 0.0, 1.0)[:, None]
+        share = np.minimum(np.maximum((time_s - earlier_s) / step_s, 0.0), 1.0)[:, None]
         rate, force = (
             values[earlier] + share * (values[later] - values[earlier])
             for values in (self.angular_rate_radps, self.specific_force_mps2)
@@ -80,12 +81,14 @@ def contiguous(
     covered_s = np.where(gap, samples.duration_s, samples.end_s - previous_s)
     scale = (samples.duration_s / covered_s)[:, None]
     rate, force = samples.angular_rate_radps * scale, samples.specific_force_mps2 * scale
+    ends_s, missing = samples.end_s, np.zeros(len(samples), np.bool_)
     before = np.flatnonzero(gap)
-    ends_s = np.insert(samples.end_s, before, begin_s[before])
-    missing = np.insert(np.zeros(len(samples), np.bool_), before, True)
-    rate, force = (
-        np.insert(each, before, 0.5 * (each[before - 1] + each[before]), axis=0) for each in (rate, force)
-    )
+    if len(before):
+        ends_s = np.insert(ends_s, before, begin_s[before])
+        missing = np.insert(missing, before, True)
+        rate, force = (
+            np.insert(each, before, 0.5 * (each[before - 1] + each[before]), axis=0) for each in (rate, force)
+        )
     bounds_s = np.concatenate([begin_s[:1], ends_s])
     if start_s is not None and start_s < bounds_s[0]:
         bounds_s, missing = np.insert(bounds_s, 0, start_s), np.insert(missing, 0, True)
@@ -93,15 +96,13 @@ def contiguous(
     if end_s is not None and end_s > bounds_s[-1]:
         bounds_s, missing = np.append(bounds_s, end_s), np.append(missing, True)
         rate, force = np.concatenate([rate, rate[-1:]]), np.concatenate([force, force[-1:]])
-    root_s = np.sqrt(np.diff(bounds_s))
-    return ContiguousSamples(
-        bounds_s,
-        rate,
-        force,
-        np.where(missing, GAP_ANGULAR_RATE_SIGMA_RADPS * root_s, noise.gyro_noise_density),
-        np.where(missing, GAP_SPECIFIC_FORCE_SIGMA_MPS2 * root_s, noise.accelerometer_noise_density),
-        missing,
-    )
+    gyro_density = np.full(len(missing), noise.gyro_noise_density)
+    accelerometer_density = np.full(len(missing), noise.accelerometer_noise_density)
+    if missing.any():
+        root_s = np.sqrt(np.diff(bounds_s)[missing])
+        gyro_density[missing] = GAP_ANGULAR_RATE_SIGMA_RADPS * root_s
+        accelerometer_density[missing] = GAP_SPECIFIC_FORCE_SIGMA_MPS2 * root_s
+    return ContiguousSamples(bounds_s, rate, force, gyro_density, accelerometer_density, missing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +128,23 @@ class Preintegrated:
 
     def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Preintegrated:
         """Return the motions over some intervals."""
-        return Preintegrated(*(getattr(self, each.name)[rows] for each in fields(self)))
+        return Preintegrated(
+            self.duration_s[rows],
+            self.position[rows],
+            self.rotation[rows],
+            self.velocity[rows],
+            self.covariance[rows],
+            self.by_gyro_bias[rows],
+            self.by_accelerometer_bias[rows],
+            self.gyro_bias[rows],
+            self.accelerometer_bias[rows],
+            self.missing_s[rows],
+        )
 
     def mean_force(self) -> FloatArray:
         """(K, 3) mean specific force, in the turning axes of the IMU, without the bias that was subtracted."""
         # An interval may have no length.
-        integral = 1e-12 * np.eye(3) - self.by_accelerometer_bias[:, 6:9]
+        integral = 1e-12 * IDENTITY - self.by_accelerometer_bias[:, 6:9]
         return matvec(np.asarray(np.linalg.inv(integral), np.float64), self.velocity)
 
     def corrected(
@@ -151,7 +163,7 @@ class Preintegrated:
 def concatenate_preintegrated(parts: list[Preintegrated]) -> Preintegrated:
     """Join motions in the given order."""
     return Preintegrated(
-        *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Preintegrated))
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in Preintegrated.__slots__)
     )
 
 
@@ -209,9 +221,13 @@ def _parts(
 ) -> Iterator[_Part]:
     """Divide intervals into parts of limited size."""
     count = len(start_s)
-    first = np.clip(np.searchsorted(samples.bounds_s, start_s, side="right") - 1, 0, len(samples) - 1)
-    stop = np.clip(np.searchsorted(samples.bounds_s, end_s, side="left"), first + 1, len(samples))
+    first = samples.bounds_s.searchsorted(start_s, side="right") - 1
+    first = np.minimum(np.maximum(first, 0), len(samples) - 1)
+    stop = np.minimum(np.maximum(samples.bounds_s.searchsorted(end_s), first + 1), len(samples))
     size = stop - first
+    if count * int(size.max(initial=0)) <= _PARTS_PER_CHUNK:
+        yield _Part(start_s, end_s, first, size, biases)
+        return
     begin = 0
     while begin < count:
         # Intervals of one chunk are padded to the longest.
@@ -253,11 +269,19 @@ def _integrals(samples: ContiguousSamples, part: _Part) -> _Integrals:
     delta_R, J_r = exp_and_right_jacobian(angle)
     rotation = np.empty((count, longest + 1, 3, 3))
     rotation[:, 0] = IDENTITY
-    for i in range(longest):
-        np.matmul(rotation[:, i], delta_R[:, i], out=rotation[:, i + 1])
+    if longest < _ROWS_PER_SCAN * count:
+        for i in range(longest):
+            np.matmul(rotation[:, i], delta_R[:, i], out=rotation[:, i + 1])
+    else:
+        # More products in fewer calls: those of 1, 2, 4 ... successive samples.
+        rotation[:, 1:] = delta_R
+        width = 1
+        while width < longest:
+            rotation[:, 1 + width :] = rotation[:, 1:-width] @ rotation[:, 1 + width :]
+            width *= 2
     # Integral of the rotation over each sample, from the axes during it to those at the start: the transpose of the right
     # Jacobian is the left one. It takes the force to an increment of velocity, and a bias to an error of rotation.
-    integral = rotation[:, :-1] @ np.swapaxes(J_r, 2, 3)
+    integral = rotation[:, :-1] @ J_r.swapaxes(2, 3)
     integral *= dt_s[..., None, None]
     increment = matvec(integral, force)
     moments = increment * remaining_s[..., None]
@@ -272,13 +296,13 @@ def _integrate(samples: ContiguousSamples, part: _Part) -> Preintegrated:
     """Preintegrate intervals."""
     index, dt_s, remaining_s, angle, force, integral, end_rotation, lever, total = _integrals(samples, part)
     count, longest = dt_s.shape
-    end_rotation_T = np.swapaxes(end_rotation, 1, 2)
+    end_rotation_T = end_rotation.swapaxes(1, 2)
     # The increment's mean time is a little off the middle of the sample, for it turns meanwhile.
     sculling = matvec(integral, cross(angle, force)) * (dt_s / 12)[..., None]
 
     weights = np.empty((count, longest, 8))
     weights[..., 0], weights[..., 1], weights[..., 2:] = 1.0, remaining_s, lever
-    sums = (np.swapaxes(weights, 1, 2) @ integral.reshape(count, longest, 9)).reshape(count, 8, 3, 3)
+    sums = (weights.swapaxes(1, 2) @ integral.reshape(count, longest, 9)).reshape(count, 8, 3, 3)
     by_gyro_bias, by_accelerometer_bias = np.empty((count, 9, 3)), np.zeros((count, 9, 3))
     by_accelerometer_bias[:, 0:3], by_accelerometer_bias[:, 6:9] = -sums[:, 1], -sums[:, 0]
     by_gyro_bias[:, 0:3], by_gyro_bias[:, 6:9] = _sum_of_crosses(sums[:, 5:8]), _sum_of_crosses(sums[:, 2:5])
@@ -314,14 +338,14 @@ def _by_matrices(samples: ContiguousSamples, part: _Part) -> tuple[FloatArray, F
         ],
         axis=2,
     )
-    sums = np.swapaxes(weights, 1, 2) @ found.integral.reshape(count, longest, 9)
+    sums = weights.swapaxes(1, 2) @ found.integral.reshape(count, longest, 9)
     # (K, weight, component of the measured vector, 3, 3)
     by_rate, by_force = (
         sums[:, :21].reshape(count, 7, 3, 3, 3),
         sums[:, 21:].reshape(count, 2, 3, 3, 3),
     )
     by_gyro, by_accelerometer = np.empty((count, 9, 3, 3)), np.zeros((count, 9, 3, 3))
-    end_rotation_T = np.swapaxes(found.end_rotation, 1, 2)
+    end_rotation_T = found.end_rotation.swapaxes(1, 2)
     for column in range(3):
         by_gyro[:, 3:6, :, column] = end_rotation_T @ by_rate[:, 0, column]
         by_gyro[:, 0:3, :, column] = -_sum_of_crosses(by_rate[:, 4:7, column])
@@ -359,7 +383,7 @@ def _covariance(
     """
     covariance = np.zeros((len(lever), 9, 9))
     weighted = lever * gyro_variance[..., None]
-    moments = np.swapaxes(weighted, 1, 2) @ lever
+    moments = weighted.swapaxes(1, 2) @ lever
     sums = weighted.sum(axis=1)
     position, rotation, velocity = slice(0, 3), slice(3, 6), slice(6, 9)
     of_position, of_velocity = slice(3, 6), slice(0, 3)
@@ -370,7 +394,7 @@ def _covariance(
     ):
         product = moments[:, a, b]
         trace = product[:, 0, 0] + product[:, 1, 1] + product[:, 2, 2]
-        covariance[:, rows, columns] = trace[:, None, None] * IDENTITY - np.swapaxes(product, 1, 2)
+        covariance[:, rows, columns] = trace[:, None, None] * IDENTITY - product.swapaxes(1, 2)
     covariance[:, rotation, rotation] = gyro_variance.sum(axis=1)[:, None, None] * IDENTITY
     # The transpose of ``-skew(lever)`` is ``skew(lever)``.
     covariance[:, rotation, position] = end_rotation_T @ skew(sums[:, of_position])
@@ -380,8 +404,8 @@ def _covariance(
         (position, velocity, (force_variance * remaining_s).sum(axis=1)),
         (velocity, velocity, force_variance.sum(axis=1)),
     ):
-        np.einsum("kii->ki", covariance[:, rows, columns])[...] += variance[:, None]
-    covariance[:, position, rotation] = np.swapaxes(covariance[:, rotation, position], 1, 2)
-    covariance[:, velocity, rotation] = np.swapaxes(covariance[:, rotation, velocity], 1, 2)
-    covariance[:, velocity, position] = np.swapaxes(covariance[:, position, velocity], 1, 2)
+        covariance[:, rows, columns] += variance[:, None, None] * IDENTITY
+    covariance[:, position, rotation] = covariance[:, rotation, position].swapaxes(1, 2)
+    covariance[:, velocity, rotation] = covariance[:, rotation, velocity].swapaxes(1, 2)
+    covariance[:, velocity, position] = covariance[:, position, velocity].swapaxes(1, 2)
     return covariance

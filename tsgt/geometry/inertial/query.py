@@ -15,7 +15,7 @@ import numpy as np
 from tsgt.errors import GeometryError
 from tsgt.geometry.inertial.preintegration import Preintegrated, preintegrate
 from tsgt.geometry.inertial.sensitivity import by_mounting
-from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, concatenate_inertial_states
 from tsgt.geometry.rigid import (
     IDENTITY,
     FloatArray,
@@ -47,20 +47,22 @@ class Predicted(NamedTuple):
     velocity: FloatArray  # (N, 3)
     by_start: FloatArray  # (N, 9, 15) Jacobian of the error of position, rotation and velocity
     noise: FloatArray  # (N, 9, 9) covariance of that error from the samples' noise
+    force: FloatArray  # (N, 3) mean specific force in between, where the accelerometer's matrix is unknown
 
 
 def strapdown(start: InertialStates, gravity: Gravity, motion: Preintegrated) -> Predicted:
     """Propagate N states by motions that begin at their times; biases are those of the states, to first order."""
-    bias = start.bias_or_acceleration
+    bias = force = start.bias_or_acceleration
     if gravity.matrix.size:
-        bias = bias + gravity.force_error(motion.mean_force())
+        force = motion.mean_force()
+        bias = bias + gravity.force_error(force)
     delta_p, delta_R, delta_v = motion.corrected(start.gyro_bias, bias)
     R, duration_s = start.rotation, motion.duration_s[:, None]
     fall = gravity.vector()
     by_start = np.zeros((len(start), 9, INERTIAL_STATE_DIM))
     by_start[:, 0:3, 0:3] = by_start[:, 6:9, 6:9] = IDENTITY
     by_start[:, 0:3, 6:9] = duration_s[..., None] * IDENTITY
-    by_start[:, 3:6, 3:6] = np.swapaxes(delta_R, 1, 2)
+    by_start[:, 3:6, 3:6] = delta_R.swapaxes(1, 2)
     by_start[:, 0:3, 3:6], by_start[:, 6:9, 3:6] = -R @ skew(delta_p), -R @ skew(delta_v)
     to_station = _to_station(R)
     by_start[:, :, 9:12] = to_station @ motion.by_gyro_bias
@@ -70,7 +72,8 @@ def strapdown(start: InertialStates, gravity: Gravity, motion: Preintegrated) ->
         R @ delta_R,
         start.velocity + duration_s * fall + matvec(R, delta_v),
         by_start,
-        to_station @ motion.covariance @ np.swapaxes(to_station, 1, 2),
+        to_station @ motion.covariance @ to_station.swapaxes(1, 2),
+        force,
     )
 
 
@@ -138,18 +141,14 @@ class InertialTrajectory:
         return concatenate_states(list(states)), np.concatenate(covariances), np.concatenate(commons)
 
     def _at(self, time_s: FloatArray, *, random: bool, common: bool) -> tuple[States, FloatArray, FloatArray]:
-        knot = np.clip(np.searchsorted(self.knots.time_s, time_s, side="right") - 1, 0, len(self.knots) - 2)
-        rows, index = np.unique(knot, return_inverse=True)
+        knot = self.knots.time_s.searchsorted(time_s, side="right") - 1
+        knot = np.minimum(np.maximum(knot, 0), len(self.knots) - 2)
+        rows, index = (knot, np.zeros(1, np.intp)) if len(knot) == 1 else np.unique(knot, return_inverse=True)
         earlier, later = self.knots.select(knot), self.knots.select(knot + 1)
-        arguments = time_s, earlier, later, rows, index
-        if self.gyro_only is None:
-            position, rotation, velocity, acceleration, by_earlier, by_later, noise = self._inertial(
-                *arguments
-            )
-        else:
-            position, rotation, velocity, acceleration, by_earlier, by_later, noise = self._gyro_only(
-                *arguments
-            )
+        between = self._inertial if self.gyro_only is None else self._gyro_only
+        position, rotation, velocity, acceleration, by_earlier, by_later, noise = between(
+            time_s, earlier, later, rows, index
+        )
         by_error = self._to_reference(rotation)
         by_earlier, by_later = by_error @ by_earlier, by_error @ by_later
         rate = self.samples.at(time_s)[0] - earlier.gyro_bias
@@ -160,17 +159,17 @@ class InertialTrajectory:
             displaced = by_earlier @ self.displacement[knot] + by_later @ self.displacement[knot + 1]
             if self.mounting_factor is not None:
                 displaced += by_mounting(states, self.mounting) @ self.mounting_factor
-            by_common = displaced @ np.swapaxes(displaced, 1, 2)
+            by_common = displaced @ displaced.swapaxes(1, 2)
         if random:
-            coupling = by_earlier @ self.cross_covariance[knot] @ np.swapaxes(by_later, 1, 2)
+            coupling = by_earlier @ self.cross_covariance[knot] @ by_later.swapaxes(1, 2)
             covariance = (
-                by_earlier @ self.covariance[knot] @ np.swapaxes(by_earlier, 1, 2)
-                + by_later @ self.covariance[knot + 1] @ np.swapaxes(by_later, 1, 2)
+                by_earlier @ self.covariance[knot] @ by_earlier.swapaxes(1, 2)
+                + by_later @ self.covariance[knot + 1] @ by_later.swapaxes(1, 2)
                 + coupling
-                + np.swapaxes(coupling, 1, 2)
-                + by_error @ noise @ np.swapaxes(by_error, 1, 2)
+                + coupling.swapaxes(1, 2)
+                + by_error @ noise @ by_error.swapaxes(1, 2)
             )
-            covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
+            covariance = 0.5 * (covariance + covariance.swapaxes(1, 2))
         return states, covariance, by_common
 
     def _inertial(
@@ -182,31 +181,31 @@ class InertialTrajectory:
         index: NDArray[np.intp],
     ) -> tuple[FloatArray, ...]:
         """Motion at times between two knots, and its error by theirs, (N, 6, 15) each; see the module."""
-        part = preintegrate(
-            self.samples, earlier.time_s, time_s, earlier.gyro_bias, earlier.bias_or_acceleration
-        )
-        here = strapdown(earlier, self.gravity, part)
-        start, end = self.knots.select(rows), self.knots.time_s[rows + 1]
-        step = preintegrate(self.samples, start.time_s, end, start.gyro_bias, start.bias_or_acceleration)
-        there = Predicted(*(each[index] for each in strapdown(start, self.gravity, step)))
+        # In one pass: to the times, and each step once to its end.
+        start = concatenate_inertial_states([earlier, self.knots.select(rows)])
+        end_s = np.concatenate([time_s, self.knots.time_s[rows + 1]])
+        motion = preintegrate(self.samples, start.time_s, end_s, start.gyro_bias, start.bias_or_acceleration)
+        found, count = strapdown(start, self.gravity, motion), len(time_s)
+        here = Predicted(*(each[:count] for each in found))
+        there = Predicted(*(each[count:][index] for each in found))
         # From here to the later knot.
         remaining_s = (later.time_s - time_s)[:, None]
         fall = self.gravity.vector()
         by_here = np.zeros((len(time_s), 9, 9))
         by_here[:, 0:3, 0:3] = by_here[:, 6:9, 6:9] = IDENTITY
         by_here[:, 0:3, 6:9] = remaining_s[..., None] * IDENTITY
-        by_here[:, 3:6, 3:6] = np.swapaxes(there.rotation, 1, 2) @ here.rotation
+        by_here[:, 3:6, 3:6] = there.rotation.swapaxes(1, 2) @ here.rotation
         moved = there.position - here.position - remaining_s * here.velocity - 0.5 * remaining_s**2 * fall
         gained = there.velocity - here.velocity - remaining_s * fall
         by_here[:, 0:3, 3:6], by_here[:, 6:9, 3:6] = (
             -skew(moved) @ here.rotation,
             -skew(gained) @ here.rotation,
         )
-        gain = here.noise @ np.swapaxes(by_here, 1, 2) @ np.linalg.inv(there.noise)
+        gain = here.noise @ by_here.swapaxes(1, 2) @ np.linalg.inv(there.noise)
         error = np.concatenate(
             [
                 later.position - there.position,
-                fast_log_so3(np.swapaxes(there.rotation, 1, 2) @ later.rotation),
+                fast_log_so3(there.rotation.swapaxes(1, 2) @ later.rotation),
                 later.velocity - there.velocity,
             ],
             axis=1,
@@ -242,17 +241,17 @@ class InertialTrajectory:
         start, end = self.knots.select(rows), self.knots.time_s[rows + 1]
         step = preintegrate(self.samples, start.time_s, end, start.gyro_bias, np.zeros(3)).select(index)
         share = (part.covariance[:, 3, 3] / step.covariance[:, 3, 3])[:, None]
-        error = fast_log_so3(np.swapaxes(earlier.rotation @ step.rotation, 1, 2) @ later.rotation)
-        onward = np.swapaxes(step.rotation, 1, 2) @ part.rotation
+        error = fast_log_so3((earlier.rotation @ step.rotation).swapaxes(1, 2) @ later.rotation)
+        onward = step.rotation.swapaxes(1, 2) @ part.rotation
         # Isotropic noise, in the axes at this time.
-        correction = share * matvec(np.swapaxes(onward, 1, 2), error)
+        correction = share * matvec(onward.swapaxes(1, 2), error)
         rotation = earlier.rotation @ part.rotation @ exp_so3(correction)
         by_earlier, by_later = np.zeros((2, len(time_s), _POSE_DIM, INERTIAL_STATE_DIM))
         weight = share[..., None]
-        by_earlier[:, 3:6, 3:6] = (1.0 - weight) * np.swapaxes(part.rotation, 1, 2)
-        by_later[:, 3:6, 3:6] = weight * np.swapaxes(onward, 1, 2)
+        by_earlier[:, 3:6, 3:6] = (1.0 - weight) * part.rotation.swapaxes(1, 2)
+        by_later[:, 3:6, 3:6] = weight * onward.swapaxes(1, 2)
         by_earlier[:, 3:6, 9:12] = part.by_gyro_bias[:, 3:6] - weight * (
-            np.swapaxes(onward, 1, 2) @ step.by_gyro_bias[:, 3:6]
+            onward.swapaxes(1, 2) @ step.by_gyro_bias[:, 3:6]
         )
         noise = np.zeros((len(time_s), _POSE_DIM, _POSE_DIM))
         noise[:, 3:6, 3:6] = ((1.0 - share) * part.covariance[:, 3, 3, None])[..., None] * IDENTITY
@@ -268,7 +267,7 @@ class InertialTrajectory:
             components = slice((0, 6, 12)[kind], (0, 6, 12)[kind] + 3)
             for state, weights in ((earlier, from_earlier), (later, from_later)):
                 values = (state.position, state.velocity, state.bias_or_acceleration)[kind]
-                axes += np.swapaxes(weights[:, :, kind], 0, 1)[..., None] * values
+                axes += weights[:, :, kind].swapaxes(0, 1)[..., None] * values
             np.einsum("nii->ni", by_earlier[:, 0:3, components])[...] = from_earlier[:, 0, kind, None]
             np.einsum("nii->ni", by_later[:, 0:3, components])[...] = from_later[:, 0, kind, None]
         noise[:, diagonal, diagonal] = conditional[:, 0, 0, None] * variances

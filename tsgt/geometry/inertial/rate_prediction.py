@@ -110,19 +110,19 @@ class RotationPredictor:
         rows = len(rates) - self._order - self._horizon
         # (rows, p, 3) before each instant, newest first, and (rows, H, 3) sums after it.
         windows = np.lib.stride_tricks.sliding_window_view(rates, self._order + self._horizon, axis=0)
-        windows = np.swapaxes(windows[:rows], 1, 2)
+        windows = windows[:rows].swapaxes(1, 2)
         before = windows[:, : self._order][:, ::-1]
         mean = before.mean(axis=1, keepdims=True)
         before, after = before - mean, np.cumsum(windows[:, self._order :] - mean, axis=1)
-        spread = _spread(np.swapaxes(before[:, : self._spread_rows()], 0, 1))
+        spread = _spread(before[:, : self._spread_rows()].swapaxes(0, 1))
         decay = float(np.exp(-rows * self._interval_s / MEMORY_S))
         if self._coefficients is not None:
             # How well the coefficients so far predict what follows.
             error = after - self._coefficients @ before
             self._squares = decay * self._squares + (error**2).sum(axis=(0, 2)) / 3
             self._power = decay * self._power + float(spread.sum())
-        x = np.swapaxes(before, 1, 2).reshape(-1, self._order)
-        y = np.swapaxes(after, 1, 2).reshape(-1, self._horizon)
+        x = before.swapaxes(1, 2).reshape(-1, self._order)
+        y = after.swapaxes(1, 2).reshape(-1, self._horizon)
         self._normal = decay * self._normal + x.T @ x
         self._right = decay * self._right + x.T @ y
         self._learnt_s += rows * self._interval_s

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,11 +31,16 @@ class InertialSamples:
 
     def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> InertialSamples:
         """Return the samples of some rows."""
-        return InertialSamples(*(getattr(self, each.name)[rows] for each in fields(self)))
+        return InertialSamples(
+            self.end_s[rows],
+            self.duration_s[rows],
+            self.angular_rate_radps[rows],
+            self.specific_force_mps2[rows],
+        )
 
 
 def concatenate_samples(parts: Sequence[InertialSamples]) -> InertialSamples:
     """Join samples that follow each other."""
     return InertialSamples(
-        *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(InertialSamples))
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in InertialSamples.__slots__)
     )

@@ -74,7 +74,7 @@ class InertialSensitivity:
         size = factor.border.shape[1]
         mixed = np.zeros((len(factor.border), size, by_setup.shape[2]))
         np.add.at(
-            mixed[:, :INERTIAL_STATE_DIM], knot_index, np.swapaxes(jacobian, 1, 2) @ (information @ by_setup)
+            mixed[:, :INERTIAL_STATE_DIM], knot_index, jacobian.swapaxes(1, 2) @ (information @ by_setup)
         )
         shared = np.zeros((factor.border.shape[2], by_setup.shape[2]))
         if anchor is not None and anchor_displacement is not None:

@@ -153,15 +153,15 @@ def fit_inertial_trajectory(
     near, gravity = find_start(mounted, setup, prior)
     count = max(round(float(time_s[-1] - time_s[0]) / SEGMENT_S), 1)
     edges_s = np.linspace(time_s[0], time_s[-1], count + 1)
-    ends = [0, *np.searchsorted(time_s, edges_s[1:-1]).tolist(), len(time_s)]
+    ends = [0, *time_s.searchsorted(edges_s[1:-1]).tolist(), len(time_s)]
     knot_index = nearest_knots(time_s, mounted.time_s)
 
     def solve(
         start_s: float, end_s: float, near: InertialStates | None, guess: InertialStates | None = None
     ) -> tuple[InertialSolution, Observations, int]:
         """Solve a stretch from states close to it, or from a guess of all states."""
-        solved = slice(*np.searchsorted(time_s, (start_s, np.nextafter(end_s, np.inf))))
-        rows = slice(*np.searchsorted(knot_index, (solved.start, solved.stop)))
+        solved = slice(*time_s.searchsorted((start_s, np.nextafter(end_s, np.inf))))
+        rows = slice(*knot_index.searchsorted((solved.start, solved.stop)))
         some = mounted.select(rows)
         preintegrated = None
         if guess is not None:
@@ -185,7 +185,7 @@ def fit_inertial_trajectory(
             found = _with_large_slip(found, some, replace(setup, odometry=wheels))
         return found, some, solved.start
 
-    first = int(np.clip(np.searchsorted(edges_s, near.time_s[0], side="right") - 1, 0, count - 1))
+    first = int(np.clip(edges_s.searchsorted(near.time_s[0], side="right") - 1, 0, count - 1))
     while (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
         if near.time_s[0] <= time_s[0] and near.time_s[-1] >= time_s[-1]:
             break
@@ -272,7 +272,7 @@ class _Part:
         motion = slice(INERTIAL_STATE_DIM)
         whole, cross_covariance = solution.factor.marginals()
         covariance, cross_covariance = whole[:, motion, motion], cross_covariance[:, motion, motion]
-        rows = slice(*np.searchsorted(solution.knot_index, (kept.start, kept.stop)))
+        rows = slice(*solution.knot_index.searchsorted((kept.start, kept.stop)))
         displacement = None
         if setup_jacobian is not None:
             displacement = setup_displacement(

@@ -8,7 +8,7 @@ slip, and the direction of travel.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -57,7 +57,16 @@ class InertialStates:
 
     def select(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> InertialStates:
         """Return the states of some rows."""
-        return InertialStates(*(getattr(self, each.name)[rows] for each in fields(self)))
+        # Written out: live, a few states are selected thousands of times a minute.
+        return InertialStates(
+            self.time_s[rows],
+            self.position[rows],
+            self.rotation[rows],
+            self.velocity[rows],
+            self.gyro_bias[rows],
+            self.bias_or_acceleration[rows],
+            self.wheels[rows],
+        )
 
     def with_wheels(self) -> InertialStates:
         """Return the states with wheel odometry that is exact."""
@@ -80,7 +89,7 @@ class InertialStates:
         return np.concatenate(
             [
                 self.position - other.position,
-                fast_log_so3(np.swapaxes(other.rotation, 1, 2) @ self.rotation),
+                fast_log_so3(other.rotation.swapaxes(1, 2) @ self.rotation),
                 self.velocity - other.velocity,
                 self.gyro_bias - other.gyro_bias,
                 self.bias_or_acceleration - other.bias_or_acceleration,
@@ -93,7 +102,7 @@ class InertialStates:
 def concatenate_inertial_states(parts: list[InertialStates]) -> InertialStates:
     """Concatenate states in the given order."""
     return InertialStates(
-        *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(InertialStates))
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in InertialStates.__slots__)
     )
 
 

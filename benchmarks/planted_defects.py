@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 import pytest
-from harness import defects
+from harness import defects, defects_published
 from harness.defects import Planting
 
 from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
@@ -202,6 +202,41 @@ DEFECTS: Final = {
         duration_s=100,
     ),
     "torn": Defect("half a line is not cut off", defects.keep_torn_line, (F.DISK_FULL,), duration_s=100),
+    "late-5ms": Defect(
+        "one station is taken 5 ms late, continuous",
+        defects_published.date_station_late(0.005),
+        estimator="continuous",
+    ),
+    "late-20ms": Defect(
+        "one station is taken 20 ms late, continuous",
+        defects_published.date_station_late(0.020),
+        estimator="continuous",
+    ),
+    "covariance-large": Defect(
+        "the covariance is too large by 4", defects_published.quadruple_covariance, estimator="continuous"
+    ),
+    "digit": Defect("a recorded pose differs in its last digit", defects_published.record_other_digit),
+    "lost-classic": Defect(
+        "every fiftieth polled measurement is lost, classic",
+        defects_published.lose_polled_measurement,
+        protocol="classic",
+    ),
+    "mirrored": Defect("horizontal angles have the wrong sign", defects_published.mirror_horizontal_angles),
+    "mirrored-continuous": Defect(
+        "the same, continuous", defects_published.mirror_horizontal_angles, estimator="continuous"
+    ),
+    "swapped": Defect("the lever arms of two prisms are swapped", defects_published.swap_prisms),
+    "swapped-continuous": Defect(
+        "the same, continuous", defects_published.swap_prisms, estimator="continuous"
+    ),
+    "acknowledged": Defect(
+        "acknowledgements are not journalled", defects_published.never_journal_acknowledgements
+    ),
+    "count-valid": Defect("the status counts all poses as valid", defects_published.count_all_poses_as_valid),
+    "age": Defect("the ages in the poses are 0", defects_published.publish_age_zero),
+    "age-continuous": Defect(
+        "the same, continuous", defects_published.publish_age_zero, estimator="continuous"
+    ),
     "queue": Defect(
         "a reader's queue has no bound", defects.unbound_reader_queue, script=sleeping_reader, duration_s=122
     ),

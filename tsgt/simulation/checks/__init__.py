@@ -1,7 +1,12 @@
 """Invariants of simulated missions: what must hold whatever faults occur.
 
-In: a :class:`MissionResult`. Out: violations, each with subject, measured value and limit. `invariants` checks data and
-files, `pose_consistency` poses against the truth, `liveness` recovery after faults, `memory_bounds` collection sizes.
+In: a :class:`MissionResult`. Out: violations, each with subject, measured value and limit. `invariants` names them all and
+checks measurements and journals; each other file is one check:
+
+- poses against the truth: `pose_consistency` (each), `covariance_scale`, `pose_lateness` (many); against the measurements:
+  `pose_ages`, `expected_poses`;
+- stream, files and status: `recorded_lines`, `status_numbers`, `poll_replies`, `acknowledgements`;
+- `liveness` after faults, `memory_bounds`, samples of IMU and wheels (`imu_samples`, `odometry_samples`).
 """
 
 from tsgt.simulation.checks.invariants import Violation, check_invariants

@@ -16,10 +16,20 @@ from tsgt.master.classic import UNTIMED_SIGMA_NS
 from tsgt.master.replay import replayed
 from tsgt.model import Status
 from tsgt.recording import load_recording
+from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
+from tsgt.simulation.checks.covariance_scale import scale_failures
+from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.imu_samples import imu_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.odometry_samples import odometry_failures
+from tsgt.simulation.checks.poll_replies import unpublished_replies
+from tsgt.simulation.checks.pose_ages import age_failures
 from tsgt.simulation.checks.pose_consistency import pose_failures
+from tsgt.simulation.checks.pose_lateness import lateness_failures
+from tsgt.simulation.checks.pose_rules import rule_failures
+from tsgt.simulation.checks.pose_twists import twist_failures
+from tsgt.simulation.checks.recorded_lines import recording_failures
+from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.faults import NTP_SLEW_PPM
 from tsgt.simulation.mission import JournalIndex
 
@@ -60,9 +70,12 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
 
     - Every reading of a client is journalled once, with the instrument's values and the time of the measurement.
     - Measurements are delivered as journalled, and at most once.
-    - Over ``superframe``, every measurement is recorded or still queued.
+    - Over ``superframe``, every measurement is recorded or still queued; over ``classic``, every one that was polled is published.
     - Timestamp errors are within the stated bounds.
-    - Valid poses rest on usable measurements and agree with the truth within their covariance.
+    - Valid poses rest on usable measurements and agree with the truth within their covariance, which is not too large; they are
+      neither late nor early, and state the right ages.
+    - Without faults, poses are valid where the measurements allow it.
+    - The recording is the stream, and the status counts what is on it.
     - A replay of the recording reproduces the stream.
     - Recorded samples of IMU and wheel odometry are those that they gave, at their true times; silent wheels are an event.
     - After the faults, rates recover; collections in memory stay bounded.
@@ -78,7 +91,17 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
             found += lost_measurements(
                 station_log, indices[number], recorded, result.master_logs[-1].session_number
             )
+    found += (Violation("liveness", what) for what in missing_acknowledgements(result, indices))
+    found += (Violation("liveness", what) for what in missing_poses(result))
     for master_log in result.master_logs:
+        found += (Violation("recording", what) for what in recording_failures(master_log))
+        found += (Violation("status", what) for what in status_failures(master_log))
+        found += (Violation("lost", what) for what in unpublished_replies(master_log))
+        found += (Violation("pose", what) for what in age_failures(master_log, result.parameters))
+        found += (Violation("pose", what) for what in lateness_failures(master_log, result, indices))
+        found += (Violation("pose", what) for what in scale_failures(master_log, result))
+        found += (Violation("pose", what) for what in twist_failures(master_log, result))
+        found += (Violation("pose", what) for what in rule_failures(master_log, result.parameters))
         found += duplicate_deliveries(master_log)
         found += timestamp_violations(
             master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)

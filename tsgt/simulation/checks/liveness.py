@@ -34,11 +34,6 @@ costs 0.06, each of about five unanswered polls 0.03. Predicted poses do not cou
 age of the newest measurement.
 """
 
-ACKNOWLEDGEMENT_TIMEOUT_S = 20.0
-"""Maximum time from delivery to acknowledgement. A beacon acknowledges within a second or two; the journal records it at
-most every five.
-"""
-
 
 def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]) -> Iterator[str]:
     """Yield what has not recovered at the end of a mission with faults, one line each."""
@@ -69,7 +64,6 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
                 f"station {number}: {delivered[number]} of {read} readings in the {seconds:g} s from {from_s:g} s on "
                 f"delivered, minimum share {min_share:g}"
             )
-    yield from missing_acknowledgements(result, indices)
     poses = master_log.valid_poses()
     at_s = (
         poses.stamp_ns[np.isin(poses.series, ("interpolated", "smoothed"))] - master_log.unix_at_zero_ns
@@ -92,18 +86,3 @@ def pose_share(protocol: str, *, stations: int, knocked: bool) -> float:
     An IMU that was knocked is set up wrongly for good. Fewer than three stations have no poses without it.
     """
     return 0.0 if knocked and stations < MIN_PRISMS else MIN_VALID_SHARE[protocol]
-
-
-def missing_acknowledgements(result: MissionResult, indices: Mapping[int, JournalIndex]) -> Iterator[str]:
-    """Yield delivered measurements that are still in their stations' queues."""
-    master_log = result.master_logs[-1]
-    if not result.superframe:
-        return
-    oldest = {number: indices[number].oldest_queued() for number in result.station_logs}
-    for measurement, arrived_ns in zip(master_log.measurements, master_log.arrived_ns, strict=False):
-        waited_s = result.duration_s - arrived_ns / 1e9
-        if measurement.sequence == oldest[measurement.station] and waited_s > ACKNOWLEDGEMENT_TIMEOUT_S:
-            yield (
-                f"station {measurement.station}: sequence number {measurement.sequence} unacknowledged {waited_s:.0f} s "
-                f"after its delivery, limit {ACKNOWLEDGEMENT_TIMEOUT_S:g} s"
-            )

@@ -34,6 +34,7 @@ from tsgt.simulation.mission.daemon_configs import (
     radio_config,
     station_name,
 )
+from tsgt.simulation.mission.poll_replies import observed
 from tsgt.simulation.mission.run_log import START_UNIX_NS, MasterLog, ObservedInstrument, StationLog
 from tsgt.simulation.wheel_odometry import OdometryModel, OdometryProgram, simulate_odometry
 from tsgt.simulation.world import is_shaken, scenario_world
@@ -275,13 +276,16 @@ class Mission:
         folder.mkdir()
         computer = self.computers[MASTER]
         writer = computer.new_writer()
+        open_radio = computer.radio()
+        if not self.superframe:
+            open_radio = observed(open_radio, master_log.poll_replies.append)
         computer.start(
             run_master(
                 config,
                 self.parameters,
                 self._settings,
                 MasterDependencies(
-                    open_radio=computer.radio(),
+                    open_radio=open_radio,
                     clock=self.clock,
                     key=self._key,
                     random_bits=self._random_bits,

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.faults.catalogue import FaultKind
     from tsgt.simulation.imu import SimulatedImuRun
     from tsgt.simulation.instrument import ReportedDistance
+    from tsgt.simulation.mission.poll_replies import PollReply
     from tsgt.simulation.options import Outage
     from tsgt.simulation.wheel_odometry import OdometrySamples as SimulatedOdometry
     from tsgt.simulation.world import World
@@ -47,6 +48,7 @@ START_UNIX_NS = 1_800_000_000_000_000_000
 """Unix time at the start of each simulated mission, on the master's clock: 15 January 2027."""
 
 _HEAD_LINES = 2
+_UNKNOWN = (np.nan, np.nan, np.nan)
 # Tasks of a killed daemon may run a little longer.
 _SHUTDOWN_NS = 5_000_000
 # Clock offsets from two valid beacons agree to within this.
@@ -69,10 +71,21 @@ class ValidPoses:
     sent_age_s: NDArray[np.float64]  # (N,) age of the pose when it was published
     with_imu: NDArray[np.bool_]  # (N,) whether it rests on the IMU
     covariance: NDArray[np.float64]  # (N, 6, 6) as published
+    velocity_mps: NDArray[np.float64]  # (N, 3) as published
+    angular_velocity_radps: NDArray[np.float64]  # (N, 3) as published
+    station_age_s: NDArray[np.float64]  # (N, M) age of each prism's last measurement, as published; NaN: none
 
     def select(self, rows: NDArray[np.bool_]) -> ValidPoses:
         """Return the poses of these rows."""
         return ValidPoses(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+class PublishedCounts(NamedTuple):
+    """How much a master had published before a status record."""
+
+    measurements: int
+    poses: int  # smoothed ones excluded, which are the same epochs again
+    valid_poses: int
 
 
 class MasterLog:
@@ -91,6 +104,8 @@ class MasterLog:
     ----------
     measurements, clocks, statuses, events
         Published records.
+    counts_at_status
+        What had been published by each status: before the poses that directly precede it, and with them.
     frame_count, frames_duration_ns
         Number of frames from the first to the last beacon, and their total duration.
     """
@@ -105,8 +120,13 @@ class MasterLog:
         self.arrived_ns: list[int] = []  # True time of each measurement's publication, in ns from the start
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
+        self.counts_at_status: list[tuple[PublishedCounts, PublishedCounts]] = []
         self.events: list[EventRecord] = []
+        self.poll_replies: list[PollReply] = []  # received over protocol classic
         self.pose_counts: Counter[str] = Counter()  # number of poses, valid or not, by series
+        self.epochs_ns: dict[
+            str, array[int]
+        ] = {}  # epochs of all poses, valid or not, by series in their order
         self.predicted_with_imu = 0  # number of predicted poses, valid or not, that rest on the IMU
         self.frame_count = 0
         self.frames_duration_ns = 0
@@ -118,6 +138,8 @@ class MasterLog:
         self._pose_series = array("b")
         self._pose_numbers = array("d")
         self._pose_sent_ages_s = array("d")
+        self._pose_station_ages_s = array("d")
+        self._counts = self._counts_before_poses = PublishedCounts(0, 0, 0)
         self._pose_with_imu = array("b")
 
     def observe(self, record: object, line: bytes) -> None:
@@ -132,10 +154,13 @@ class MasterLog:
             self.clocks.append(record)
         elif isinstance(record, StatusRecord):
             self.statuses.append(record)
+            self.counts_at_status.append((self._counts_before_poses, self._counts))
         elif isinstance(record, EventRecord):
             self.events.append(record)
         elif isinstance(record, PoseRecord):
             self.pose_counts[record.series] += 1
+            self.epochs_ns.setdefault(record.series, array("q")).append(record.stamp_ns)
+            self._count(record)
             self.predicted_with_imu += record.kind == "predicted" and record.imu == "used"
             if record.valid:
                 self._observe_pose(record)
@@ -147,22 +172,36 @@ class MasterLog:
                 record.stamp_ns - first.stamp_ns,
             )
 
+        if not isinstance(record, PoseRecord):
+            self._counts = self._counts._replace(measurements=len(self.measurements))
+            self._counts_before_poses = self._counts
+
+    def _count(self, pose: PoseRecord) -> None:
+        if pose.kind != "smoothed":
+            counts = self._counts
+            self._counts = counts._replace(
+                poses=counts.poses + 1, valid_poses=counts.valid_poses + pose.valid
+            )
+
     def _observe_pose(self, pose: PoseRecord) -> None:
         self._pose_stamps.append(pose.stamp_ns)
         self._pose_measurements_before.append(len(self.measurements))
         self._pose_numbers.extend(pose.position_m or ())
         self._pose_numbers.extend(pose.orientation_xyzw or ())
         self._pose_numbers.append(np.nan if pose.residual_m is None else pose.residual_m)
-        ages_s = (share.age_s for share in pose.stations if share.age_s is not None)
-        self._pose_numbers.append(min(ages_s, default=np.nan))
+        ages_s = [np.nan if share.age_s is None else share.age_s for share in pose.stations]
+        self._pose_station_ages_s.extend(ages_s)
+        self._pose_numbers.append(min((age_s for age_s in ages_s if age_s == age_s), default=np.nan))
         self._pose_sent_ages_s.append((self._now_ns() + self.unix_at_zero_ns - pose.stamp_ns) / 1e9)
         self._pose_numbers.extend(pose.covariance or ())
+        self._pose_numbers.extend(pose.velocity_mps or _UNKNOWN)
+        self._pose_numbers.extend(pose.angular_velocity_radps or _UNKNOWN)
         self._pose_with_imu.append(pose.imu == "used")
         self._pose_series.append(self._series.setdefault(pose.series, len(self._series)))
 
     def valid_poses(self) -> ValidPoses:
         """Return the valid poses published so far."""
-        numbers = np.array(self._pose_numbers).reshape(-1, 45)
+        numbers = np.array(self._pose_numbers).reshape(-1, 51)
         return ValidPoses(
             stamp_ns=np.array(self._pose_stamps, dtype=np.int64),
             position_m=numbers[:, :3],
@@ -173,7 +212,12 @@ class MasterLog:
             newest_age_s=numbers[:, 8],
             sent_age_s=np.array(self._pose_sent_ages_s),
             with_imu=np.array(self._pose_with_imu, dtype=np.bool_),
-            covariance=numbers[:, 9:].reshape(-1, 6, 6),
+            covariance=numbers[:, 9:45].reshape(-1, 6, 6),
+            velocity_mps=numbers[:, 45:48],
+            angular_velocity_radps=numbers[:, 48:],
+            station_age_s=np.array(self._pose_station_ages_s).reshape(
+                len(numbers), -1 if len(numbers) else 0
+            ),
         )
 
     def recording(self) -> Path | None:
@@ -258,11 +302,16 @@ class JournalIndex:
         return None if host_time_ns is None else self._true_ns.get(host_time_ns)
 
     def oldest_queued(self) -> int | None:
-        """Return the lowest unacknowledged sequence number of the last journal, which records it at most every 5 s; None: not recorded."""
+        """Return the lowest unacknowledged sequence number by the last journal, which records it at most every 5 s.
+
+        Without such a record: the first in that journal; None: there is neither.
+        """
         if (path := self._last_journal) is None:
             return None
-        reception = [line for line in read_lines(path) if line.type == "acknowledged"]
-        return decode_line(AcknowledgedRecord, reception[-1], path).oldest if reception else None
+        acknowledged = [line for line in read_lines(path) if line.type == "acknowledged"]
+        if not acknowledged:
+            return min((m.sequence for m in load_journal(path).measurements), default=None)
+        return decode_line(AcknowledgedRecord, acknowledged[-1], path).oldest
 
     def has_no_timestamp(self, sequence: int, session: int | None) -> bool:
         """Whether a measurement cannot be converted to the time of a master's session.

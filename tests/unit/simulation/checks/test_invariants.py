@@ -19,8 +19,8 @@ from tsgt.model import Status
 from tsgt.recording import EventRecord, encode_line
 from tsgt.recording.journal import AcknowledgedRecord
 from tsgt.simulation.checks import check_invariants, pose_consistency
+from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.invariants import reading_mismatches
-from tsgt.simulation.checks.liveness import missing_acknowledgements
 from tsgt.simulation.mission import JournalIndex
 from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
 
@@ -269,7 +269,7 @@ def test_pose_from_an_unusable_measurement_is_detected(result: MissionResult) ->
 def test_wrong_pose_is_detected(result: MissionResult) -> None:
     """A pose of ``linear`` is checked to a millimetre, one of ``continuous`` to its covariance."""
     linear = result.parameters.pipeline.estimator == "linear"
-    result.master_logs[0]._pose_numbers[45 * 100] += 1e-3 if linear else 1.0
+    result.master_logs[0]._pose_numbers[51 * 100] += 1e-3 if linear else 1.0
     assert _checks(result) == {"pose"}
 
 
@@ -281,7 +281,7 @@ def test_overconfident_or_biased_poses_are_detected(
     monkeypatch.setattr(pose_consistency, "_MIN_POSES", 300)
     session = result.master_logs[0]
     assert list(pose_consistency.distribution_failures(session, result)) == []
-    numbers = np.array(session._pose_numbers).reshape(-1, 45)
+    numbers = np.array(session._pose_numbers).reshape(-1, 51)
     if part.start:
         numbers[:, part] /= 16
     else:
@@ -294,4 +294,4 @@ def test_unrecorded_line_is_detected(result: MissionResult) -> None:
     """The replay of a recording that lacks a line differs from the stream."""
     planted = EventRecord(stamp_ns=1, event="planted", message="not in the recording")
     result.master_logs[0].observe(planted, encode_line(planted))
-    assert _checks(result) == {"replay"}
+    assert _checks(result) == {"recording", "replay"}

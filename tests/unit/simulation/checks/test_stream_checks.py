@@ -1,0 +1,167 @@
+"""Checks of stream, status and recording, on small made-up logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from harness.records import CLOCK, HEADER, PARAMETERS, POSE, SECOND, START, STATUS, imu_samples, measurement
+
+from tsgt.radio.classic import OK, MeasurementMessage
+from tsgt.recording import StationStatus, encode_line
+from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
+from tsgt.simulation.checks.expected_poses import missing_poses
+from tsgt.simulation.checks.poll_replies import unpublished_replies
+from tsgt.simulation.checks.pose_ages import age_failures
+from tsgt.simulation.checks.recorded_lines import recording_failures
+from tsgt.simulation.checks.status_numbers import status_failures
+from tsgt.simulation.mission import MasterLog
+from tsgt.simulation.mission.poll_replies import PollReply
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def _log(folder: Path, *records: object) -> MasterLog:
+    log = MasterLog(folder, lambda: 0, START)
+    for record in records:
+        log.observe(record, encode_line(record))
+    return log
+
+
+@pytest.mark.parametrize(
+    ("crashed", "changed", "count"), [(False, b"", 0), (True, b"0.0023", 1), (False, b"0.0023", 1)]
+)
+def test_recorded_line_that_differs_from_the_stream(
+    tmp_path: Path, *, crashed: bool, changed: bytes, count: int
+) -> None:
+    """In one digit; lines that are not on the stream do not count."""
+    log = _log(tmp_path, measurement(0), imu_samples(0), POSE, STATUS)
+    log.crashed = crashed
+    records = (HEADER, PARAMETERS, measurement(0), imu_samples(0), POSE, STATUS)
+    content = b"".join(encode_line(record) + b"\n" for record in records)
+    assert b"0.0021" in content
+    (tmp_path / "a.jsonl").write_bytes(content.replace(b"0.0021", changed or b"0.0021"))
+    assert len(list(recording_failures(log))) == count
+
+
+@pytest.mark.parametrize("crashed", [False, True])
+def test_recording_that_ends_early(tmp_path: Path, *, crashed: bool) -> None:
+    """Allowed to a master that was killed, also in the middle of a line."""
+    log = _log(tmp_path, measurement(0), POSE)
+    log.crashed = crashed
+    whole = b"".join(encode_line(record) + b"\n" for record in (HEADER, PARAMETERS, measurement(0), POSE))
+    (tmp_path / "a.jsonl").write_bytes(whole[:-9])
+    assert bool(list(recording_failures(log))) != crashed
+
+
+def _status(**changes: Any) -> Any:
+    station = {"id": 1, "measurements": 2, "usable": 2, "age_s": 0.6, "rate_hz": 2 / 1.0}
+    counts = {"poses": 1, "valid_poses": 1}
+    station = {name: changes.get(name, value) for name, value in station.items()}
+    return replace(
+        STATUS,
+        stamp_ns=START + SECOND,
+        poses=changes.get("poses", counts["poses"]),
+        valid_poses=changes.get("valid_poses", counts["valid_poses"]),
+        stations=(StationStatus(status=None, **station),),
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "count"),
+    [
+        ({}, 0),
+        ({"poses": 2}, 0),  # the second is published just before the status
+        ({"poses": 3}, 1),
+        ({"valid_poses": 2}, 1),
+        ({"measurements": 1}, 1),
+        ({"usable": 1}, 1),
+        ({"age_s": 0.0}, 1),
+        ({"age_s": None}, 1),
+        ({"rate_hz": 2.5}, 1),
+    ],
+)
+def test_status_with_a_wrong_number(tmp_path: Path, change: dict[str, Any], count: int) -> None:
+    """Numbers of poses and measurements, age and rate; a smoothed pose is of an epoch that was counted before."""
+    smoothed = replace(POSE, kind="smoothed")
+    invalid = replace(POSE, valid=False, reason="outage")
+    log = _log(tmp_path, measurement(0), POSE, smoothed, measurement(1), invalid, _status(**change))
+    assert len(list(status_failures(log))) == count
+
+
+@pytest.mark.parametrize(("age_s", "count"), [(0.05, 0), (0.0, 1), (0.45, 1), (None, 1)])
+def test_pose_with_a_wrong_age(tmp_path: Path, age_s: float | None, count: int) -> None:
+    """The last measurement is 0.05 s before the pose."""
+    shares = (replace(POSE.stations[0], age_s=age_s),)
+    pose = replace(POSE, stamp_ns=START + 450_000_000, stations=shares)
+    log = _log(tmp_path, measurement(0), measurement(1), pose)
+    assert len(list(age_failures(log, PARAMETERS))) == count
+
+
+def test_measurement_of_a_backlog_may_be_unused(tmp_path: Path) -> None:
+    """It has arrived 1.5 s late: the pose may, but need not, state its age."""
+    late = replace(measurement(1), received_ns=measurement(1).stamp_ns + 1_500_000_000)
+    for age_s in (0.45, 0.05):
+        shares = (replace(POSE.stations[0], age_s=age_s),)
+        pose = replace(POSE, stamp_ns=START + 450_000_000, stations=shares)
+        assert not list(age_failures(_log(tmp_path, measurement(0), late, pose), PARAMETERS))
+
+
+def _reply(sequence: int) -> PollReply:
+    found = measurement(sequence)
+    assert found.slope_distance_m is not None
+    assert found.host_time_ns is not None
+    message = MeasurementMessage(
+        station=1,
+        status=OK,
+        zenith_angle_rad=found.zenith_angle_rad,
+        horizontal_angle_rad=found.horizontal_angle_rad,
+        slope_distance_m=found.slope_distance_m,
+        time_ns=found.host_time_ns,
+    )
+    return PollReply(1, message.to_bytes(), found.received_ns - START)
+
+
+@pytest.mark.parametrize(
+    ("published", "synchronised", "count"),
+    [((0, 1, 2), False, 0), ((0, 2), False, 1), ((0, 2), True, 0), ((0,), False, 0), ((2,), False, 0)],
+)
+def test_polled_measurement_that_was_not_published(
+    tmp_path: Path, *, published: tuple[int, ...], synchronised: bool, count: int
+) -> None:
+    """Only between two that were published, without a synchronisation between, which might have dropped it."""
+    log = _log(tmp_path, *(measurement(sequence) for sequence in published))
+    log.arrived_ns = [m.received_ns - START for m in log.measurements]
+    if synchronised:
+        log.clocks = [replace(CLOCK, station=1, stamp_ns=measurement(1).received_ns)]
+    log.poll_replies = [_reply(sequence) for sequence in (0, 1, 1, 2)]
+    assert len(list(unpublished_replies(log))) == count * 2  # it was polled twice
+
+
+@pytest.mark.parametrize(("valid", "count"), [(100, 0), (60, 1), (0, 1)])
+def test_poses_that_the_measurements_allow(tmp_path: Path, valid: int, count: int) -> None:
+    """Twelve seconds of all three prisms, of which five are a start; 7 s at 20 Hz are 140 poses."""
+    measured = [
+        replace(measurement(sequence), station=number, prism=number)
+        for sequence in range(31)
+        for number in (1, 2, 3)
+    ]
+    poses = [replace(POSE, valid=number < valid, reason="") for number in range(140)]
+    log = _log(tmp_path, *measured, *poses)
+    result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, master_logs=[log])
+    assert len(list(missing_poses(result))) == count
+    result.faults_end_s = 180.0
+    assert not list(missing_poses(result))
+
+
+@pytest.mark.parametrize(("oldest", "count"), [(0, 1), (1, 0), (None, 0)])
+def test_acknowledgement_that_was_not_journalled(tmp_path: Path, oldest: int | None, count: int) -> None:
+    """The first measurement arrived at the start; a minute later it is still the oldest in the queue."""
+    log = _log(tmp_path, measurement(0))
+    log.arrived_ns = [0]
+    result: Any = SimpleNamespace(superframe=True, master_logs=[log], duration_s=60.0)
+    index: Any = SimpleNamespace(oldest_queued=lambda: oldest)
+    assert len(list(missing_acknowledgements(result, {1: index}))) == count

@@ -1,0 +1,84 @@
+"""Covariances that are too large: normalised squared errors far below their expectation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry import log_so3, rotation_from_quaternion
+from tsgt.model import MIN_PRISMS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from tsgt.simulation.mission import MasterLog, MissionResult
+
+MIN_POSES = 600
+"""Minimum number of poses: half a minute."""
+
+MIN_SQUARE = 0.9
+"""Limit of the mean squared error in sigmas of position or rotation, three degrees of freedom. 3 if the covariance is exact, 1.8 to
+2.7 in missions: the noise of the times is stated conservatively, and the motion prior allows for more than robots do.
+"""
+
+MIN_PREDICTED_SQUARE = 0.6
+"""The same of predicted poses of a moving robot, 1.1 to 2.2 in missions; at rest they must allow for a start."""
+
+SIGMAS = 2.0
+"""Standard errors of the mean that are added to it."""
+
+BLOCK_S = 2.0
+"""Errors of poses farther apart than this are taken as independent: those of smoothed poses are correlated over half a second."""
+
+MIN_SPEED_MPS = 0.2
+
+_STEP_S = 0.01
+
+
+def scale_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+    """Yield the series of a master whose covariances are too large.
+
+    Fewer than three stations rest on the IMU, whose errors within one mission are hardly random.
+    """
+    if len(result.parameters.prisms) < MIN_PRISMS:
+        return
+    valid = master_log.valid_poses()
+    for series in np.unique(valid.series).tolist():
+        poses = valid.select(valid.series == series)
+        at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
+        truth = result.true_poses(at_s)
+        limit = MIN_SQUARE
+        if series == "predicted":
+            limit = MIN_PREDICTED_SQUARE
+            moved_m = result.true_poses(at_s + _STEP_S)[:, :3, 3] - truth[:, :3, 3]
+            moving = np.linalg.norm(moved_m, axis=1) > MIN_SPEED_MPS * _STEP_S
+            poses, at_s, truth = poses.select(moving), at_s[moving], truth[moving]
+        if len(at_s) < MIN_POSES:
+            continue
+        rotation = rotation_from_quaternion(poses.orientation_xyzw)
+        errors = {
+            "position": (poses.position_m - truth[:, :3, 3], poses.covariance[:, :3, :3]),
+            "rotation": (
+                log_so3(rotation @ np.swapaxes(truth[:, :3, :3], 1, 2)),
+                poses.covariance[:, 3:, 3:],
+            ),
+        }
+        for name, (error, covariance) in errors.items():
+            squares = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+            mean, sigma = mean_of_correlated(at_s, squares)
+            if mean + SIGMAS * sigma < limit:
+                yield (
+                    f"{len(at_s)} {series} poses: the mean squared error of the {name} in sigmas is {mean:.2f}, standard error "
+                    f"{sigma:.2f}, minimum {limit:g} of 3: its covariance is too large"
+                )
+
+
+def mean_of_correlated(at_s: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the mean of values at instants, and its standard error by the scatter of blocks."""
+    blocks = np.unique((at_s / BLOCK_S).astype(np.int64), return_inverse=True)[1]
+    mean = values.mean()
+    deviations = np.bincount(blocks, values - mean)
+    return float(mean), float(np.sqrt(np.sum(deviations**2)) / len(values))

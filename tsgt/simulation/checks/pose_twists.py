@@ -1,0 +1,74 @@
+"""Velocities and angular velocities of poses against the true motion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry import log_so3
+from tsgt.model import MIN_PRISMS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from tsgt.simulation.mission import MasterLog, MissionResult
+
+MIN_POSES = 600
+"""Minimum number of poses: half a minute."""
+
+MIN_RMS = 0.1
+"""Minimum rms of the true motion in m/s or rad/s."""
+
+MAX_ERROR_SHARE, MAX_PREDICTED_ERROR_SHARE = 0.4, 0.9
+"""Limits of the squared errors over the squares of the truth. Missions have up to 0.2, predictions up to 0.5, which do not know of a
+manoeuvre yet; a wrong sign gives 4, wrong axes give 1 or more.
+"""
+
+MAX_GAIN_ERROR, MAX_PREDICTED_GAIN_ERROR = 0.15, 0.25
+"""Limits of the error of the gain: estimate over truth, by least squares. Missions have 0.96 to 1.02, predictions down to 0.93."""
+
+_STEP_S = 0.01
+
+
+def twist_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+    """Yield the series whose velocities, along the axes of the frame, or angular velocities, along those of the robot, are wrong.
+
+    Fewer than three stations do not tell all of them.
+    """
+    if len(result.parameters.prisms) < MIN_PRISMS:
+        return
+    valid = master_log.valid_poses()
+    for series in np.unique(valid.series).tolist():
+        poses = valid.select(valid.series == series)
+        if len(poses.stamp_ns) < MIN_POSES:
+            continue
+        at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
+        before, after = result.true_poses(at_s - _STEP_S), result.true_poses(at_s + _STEP_S)
+        velocity_mps = (after[:, :3, 3] - before[:, :3, 3]) / (2 * _STEP_S)
+        turned_rad = log_so3(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])
+        for name, stated, true in (
+            ("velocity", poses.velocity_mps, velocity_mps),
+            ("angular velocity", poses.angular_velocity_radps, turned_rad / (2 * _STEP_S)),
+        ):
+            yield from _failures(
+                f"{len(at_s)} {series} poses: {name}", stated, true, predicted=series == "predicted"
+            )
+
+
+def _failures(
+    where: str, stated: NDArray[np.float64], true: NDArray[np.float64], *, predicted: bool
+) -> Iterator[str]:
+    squares = float(np.sum(true**2))
+    if squares < len(true) * MIN_RMS**2:
+        return
+    share = float(np.sum((stated - true) ** 2)) / squares
+    gain = float(np.sum(stated * true)) / squares
+    max_share = MAX_PREDICTED_ERROR_SHARE if predicted else MAX_ERROR_SHARE
+    max_gain_error = MAX_PREDICTED_GAIN_ERROR if predicted else MAX_GAIN_ERROR
+    if not share <= max_share:
+        yield f"{where}: squared errors are {share:.2f} of the truth's squares, limit {max_share:g}"
+    elif abs(gain - 1) > max_gain_error:
+        yield f"{where}: {gain:.3f} of the truth, limit {max_gain_error:g} from 1"

@@ -1,0 +1,42 @@
+"""The recording on disk against the stream, byte by byte."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from tsgt.simulation.mission import MasterLog
+
+_NOT_STREAMED = tuple(
+    f'{{"type":"{kind}",'.encode() for kind in ("recording", "parameters", "imu", "odometry")
+)
+"""Starts of lines that are recorded only."""
+
+
+def recording_failures(master_log: MasterLog) -> Iterator[str]:
+    """Yield the first difference between recording and stream.
+
+    The recording of a master that was killed may end early, with half a line.
+    """
+    path = master_log.recording()
+    if path is None:
+        return
+    hashes = master_log.line_hashes
+    count = 0
+    for line in _streamed_lines(path):
+        if count == len(hashes) or hash(line) != hashes[count]:
+            yield f"{path.name}: line {count + 1} of the stream was recorded as {line[:200]!r}"
+            return
+        count += 1
+    if count < len(hashes) and not master_log.crashed:
+        yield f"{path.name}: {count} lines of the stream's {len(hashes)} are recorded"
+
+
+def _streamed_lines(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        for line in file:
+            if line.endswith(b"\n") and not line.startswith(_NOT_STREAMED):
+                yield line[:-1]

@@ -1,8 +1,10 @@
 """How small a movement of a tripod the live alarm finds, and whether it cries without one.
 
     python benchmarks/run.py frame_watch
+    python benchmarks/run.py frame_watch gaps
 
-The figures stand in docs/how-to/calibrate.md, section "The live alarm".
+The second one has all stations silent for a time again and again, as a busy computer or a bad radio link, at the site of the
+rehearsal. The figures stand in docs/how-to/calibrate.md, section "Layout monitor".
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import dataclasses
 import logging
 import math
 import statistics
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +26,7 @@ from tsgt.geometry import exp_so3, transform_from
 from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.recording import PoseRecord, load_recording
 from tsgt.simulation.options import SimulationOptions
+from tsgt.simulation.rehearsal import SCENARIO
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,6 +40,8 @@ if TYPE_CHECKING:
 
 DURATION_S = 600.0
 SEEDS = (1, 2, 3)
+GAPS_S = ((math.inf, 0.0), (3.0, 2.0), (1.5, 3.0), (1.0, 5.0))
+"""Mean durations of measurements and of gaps."""
 
 
 def drive(seed: int, node: StationSoftware) -> Drive:
@@ -91,9 +97,48 @@ def report(what: str, drives: list[Drive], moves: list[FloatArray]) -> None:
     print(f"  {what}: alarm in {found} of {len(moves)}, station right in {right} {when}")
 
 
+def with_gaps(
+    measurements: Sequence[Measurement], on_s: float, off_s: float, seed: int
+) -> Sequence[Measurement]:
+    """Leave out what all stations measure in gaps; their durations, and those between them, are exponential."""
+    if not off_s:
+        return measurements
+    rng, start_ns = np.random.default_rng(seed), measurements[0].stamp_ns
+    count = int(2 * DURATION_S / (on_s + off_s))
+    changes_s = np.cumsum(np.stack([rng.exponential(on_s, count), rng.exponential(off_s, count)], axis=1))
+    return [m for m in measurements if np.searchsorted(changes_s, (m.stamp_ns - start_ns) / 1e9) % 2 == 0]
+
+
+def report_gaps() -> None:
+    """Print what is found at the site of the rehearsal."""
+    pipeline = SCENARIO.pipeline.model_copy(update={"estimator": "linear"})
+    drives = []
+    for seed in SEEDS:
+        with simulated(
+            SCENARIO.model_copy(update={"pipeline": pipeline}),
+            SimulationOptions(duration_s=DURATION_S, seed=seed),
+        ) as run:
+            path = run.master_logs[-1].recording()
+            assert path is not None  # noqa: S101 (the master has recorded)
+            drives.append((run.parameters, load_recording(path).measurements))
+    for on_s, off_s in GAPS_S:
+        print(f"{on_s:g} s of measurements, then {off_s:g} s without any, on average")
+        gapped = [
+            (parameters, with_gaps(all_, on_s, off_s, seed)) for seed, (parameters, all_) in enumerate(drives)
+        ]
+        report("nothing moved", gapped, [np.eye(4)] * len(gapped))
+        shifts = [
+            0.036 * np.array([math.cos(b), math.sin(b), 0.0]) for b in (2 * math.pi * k / 6 for k in range(6))
+        ]
+        report("36 mm in plan", gapped, [transform_from(np.eye(3), shift) for shift in shifts])
+
+
 def main() -> None:
     """Print all figures."""
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    if sys.argv[1:] == ["gaps"]:
+        report_gaps()
+        return
     node: StationSoftware
     for node in ("ours", "authors"):
         drives = [drive(seed, node) for seed in SEEDS]

@@ -84,7 +84,8 @@ class FrameWatchConfig(Model):
     residual_speed_gain_ms: Annotated[float, Field(ge=0, le=1e3)] = 6.0
     """Increase of that limit with the robot's speed."""
     window_s: Positive = 10.0
-    """The event needs three of four poses over this time above the limit."""
+    """The event needs three of four poses over this time above the limit; if poses have gaps, over as many poses as in a third
+    of it, from up to twelve times this time."""
 
 
 class GeofenceConfig(Model):

@@ -27,7 +27,8 @@ QUARTILE = 4
 
 RESTORED_RATIO = 0.8  # share of the limit below which the alarm ends; hysteresis
 
-MIN_WINDOW_SHARE = 1 / 3  # share of the window that has to hold poses before it is evaluated
+MIN_WINDOW_SHARE = 1 / 3  # as many poses as in this share of the window are judged, at least
+MAX_WINDOWS = 12  # over which they are collected if poses have gaps
 
 
 class LayoutMonitorSettings(Protocol):
@@ -43,7 +44,7 @@ class LayoutMonitorSettings(Protocol):
 
     @property
     def window_s(self) -> float:
-        """Three of four poses over this time have to exceed the limit."""
+        """Three of four poses over this time have to exceed the limit; over a longer time if poses have gaps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +90,7 @@ class LayoutMonitor(Observer):
         sample = _Sample(record.stamp_ns, 1e3 * record.residual_m, limit_mm, shares)
         self._samples.append(sample)
         bisect.insort(self._ratios, sample.ratio)
-        while self._samples[0].stamp_ns <= record.stamp_ns - self._window_ns:
+        while self._is_past(record.stamp_ns - self._samples[0].stamp_ns):
             del self._ratios[bisect.bisect_left(self._ratios, self._samples.popleft().ratio)]
         if len(self._samples) < self._min_samples:
             return []
@@ -102,6 +103,11 @@ class LayoutMonitor(Observer):
             message = f"{self._figures()}; the layout fits again"
             return [EventRecord(stamp_ns=now_ns, event="layout_residual_normal", message=message)]
         return []
+
+    def _is_past(self, age_ns: int) -> bool:
+        """Whether the oldest pose counts no longer."""
+        scarce = len(self._samples) <= self._min_samples
+        return age_ns >= self._window_ns * (MAX_WINDOWS if scarce else 1)
 
     def _alarm(self, now_ns: int) -> EventRecord:
         totals_mm: dict[int, float] = {}
@@ -123,7 +129,8 @@ class LayoutMonitor(Observer):
     def _figures(self) -> str:
         residual_mm = statistics.median(sample.residual_mm for sample in self._samples)
         limit_mm = statistics.median(sample.limit_mm for sample in self._samples)
+        span_s = (self._samples[-1].stamp_ns - self._samples[0].stamp_ns) / 1e9
         return (
             f"the prisms miss their layout by {residual_mm:.1f} mm, limit {limit_mm:.1f} mm "
-            f"(medians over {self._settings.window_s:g} s)"
+            f"(medians over {span_s:.0f} s)"
         )

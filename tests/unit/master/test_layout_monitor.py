@@ -99,10 +99,26 @@ def test_limit_grows_with_speed() -> None:
 
 
 def test_alarm_needs_a_third_of_the_window() -> None:
-    """67 of 200 poses; 66 are too few, and older ones do not count."""
+    """67 of 200 poses; 66 are too few."""
     assert not events([pose(n, 9.0) for n in range(66)])
     assert events([pose(n, 9.0) for n in range(67)])
-    assert not events([pose(n + (200 if n >= 40 else 0), 9.0) for n in range(100)])
+
+
+def test_poses_with_gaps_raise_the_alarm() -> None:
+    """Half a second of poses in every five: 67 are collected over half a minute, but not over more than two."""
+    (event,) = events([pose(n + 90 * (n // 10), 9.0) for n in range(200)])
+    assert event.stamp_ns == START + (66 + 90 * 6) * PERIOD_NS + 7
+    assert "(medians over 30 s)" in event.message
+    assert not events([pose(n + 590 * (n // 10), 9.0) for n in range(200)])
+
+
+def test_old_poses_do_not_outvote_new_ones() -> None:
+    """After a gap, those from before it count only until there are enough new ones."""
+    bad = [pose(n, 9.0) for n in range(100)]
+    assert [e.event for e in events(bad + [pose(n + 1000, 2.0) for n in range(100)])] == [
+        "layout_residual_high",
+        "layout_residual_normal",
+    ]
 
 
 def test_invalid_poses_count_for_their_residual_only() -> None:

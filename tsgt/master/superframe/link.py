@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from tsgt.radio import Direction, LoRaSettings, Packet, Radio, Transmission
     from tsgt.radio.superframe import ReceivedReply, TimedMeasurement
 
-SYNC_TIMEOUT_S = 0.015
-"""How long a beacon waits for the last reply to be written. Acknowledging a frame later costs a retransmission."""
+SYNC_TIMEOUT_S = 0.06
+"""How long a beacon waits for the last reply to be on the disk. Acknowledging a frame later costs retransmissions, which make
+frames of three stations 110 ms longer."""
 
 TRACK_RETRY_INTERVAL_NS = 30_000_000_000  # between two commands to track, while a station does not
 

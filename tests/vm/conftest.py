@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,12 +19,18 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the set-up, which needs no saved state: meanwhile another worker makes them."""
+    items.sort(key=lambda item: item.path.stem != "test_setup")
+
+
 @pytest.fixture(scope="session")
 def bare_image() -> Image:
     """Return Debian with our kernel module, without tsgt."""
     if missing := missing_tools():
         pytest.skip(f"no virtual machine: {missing}")
-    return image()
+    with _lock():
+        return image()
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +48,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def run_folder() -> Path:
     """Return an empty folder for the disks of guests, on a file system that has direct I/O."""
-    folder = CACHE / "run"
+    folder = CACHE / "run" / os.environ.get("PYTEST_XDIST_WORKER", "one")
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     return folder
@@ -122,7 +131,9 @@ def _saved(
 ) -> State:
     """Return a guest as ``prepare`` leaves it, kept in the cache until the program changes."""
     folder = CACHE / f"{name}-{_content_hash(bare_image, kvm)}"
-    if not folder.exists():
+    with _lock():
+        if folder.exists():
+            return State(folder)
         for old in CACHE.glob(f"{name}-*"):
             shutil.rmtree(old)
         with Guest(bare_image, run_folder / name, kvm=kvm) as guest:
@@ -130,6 +141,15 @@ def _saved(
             saved = guest.save(run_folder / f"saved-{name}")
         saved.folder.rename(folder)
     return State(folder)
+
+
+@contextmanager
+def _lock() -> Iterator[None]:
+    """Let one worker at a time make what is kept in the cache."""
+    CACHE.mkdir(exist_ok=True)
+    with (CACHE / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _content_hash(bare_image: Image, kvm: bool) -> str:  # noqa: FBT001 (private)

@@ -23,7 +23,7 @@ FAR_ENDS = """\
 [Unit]
 Description=Far ends of the wires
 [Service]
-ExecStartPre=/usr/sbin/modprobe sxmock
+ExecStartPre=/usr/sbin/modprobe sxmock count=4
 ExecStart=/opt/tsgt/bin/python /usr/local/lib/far_ends.py
 StandardOutput=file:/run/far_ends.log
 StandardError=file:/run/far_ends.log

@@ -1,19 +1,21 @@
-"""From a bare Debian and the offline bundle to measurements over the radio, as docs/how-to/set-up-a-pi.md says.
+"""From a bare Debian and the offline bundle to the first pose, as docs/how-to/set-up-a-pi.md and calibrate.md say.
 
-No file is edited by hand. Both machines are one guest here, with two radios: master and station are set up one after the
-other. There is one total station, so that this ends with its measurements at the master; a pose needs three prisms.
+No file of the program is edited by hand. All machines are one guest here, with four radios: master and station 1 are set up on it,
+stations 2 and 3 on a copy of its file system each, as the SD card of another Pi.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import re
 import subprocess
 import sys
 import time
 from typing import TYPE_CHECKING
 
 import pytest
-from vm import installation
+from vm import field_notes, installation
 from vm.guest import ADAPTER_PORT, Guest
 from vm.image import PYTHON, ROOT, Image
 
@@ -25,24 +27,47 @@ CONFIG_TXT = b"# as the image writer leaves it\ndtparam=audio=on\n#dtparam=spi=o
 MASTER = "tsgt setup master --spi-device spidev1.0 --gpio-chip /dev/gpiochip1"
 STATION = "tsgt setup station --spi-device spidev0.0 --gpio-chip /dev/gpiochip0"
 FIRST_MASTER = f"{MASTER} --yes --region CA915 --stations 3"
+BUNDLE, NEWER, NEWER_BUNDLE = "tsgt.deb", "99.0.0", "newer.deb"
+OTHER_STATIONS = (2, 3)
+CALIBRATION = (
+    "tsgt calibrate prisms prisms.csv --prism-constant-mm 10 --target-constant-mm 0 --apply /etc/tsgt/master.toml",
+    "tsgt calibrate targets targets.csv --target-constant-mm 0 --apply /etc/tsgt/master.toml",
+)
+NEAR_M = 0.05
 FIRST_STATION = f"{STATION} --yes --station 1 --prism-type mini_360 --mission mission.txt"
 
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the bundle for the guest's Python; needs the network."""
+    """Return a folder with the bundle for the guest's Python, and a newer one; needs the network."""
     folder = tmp_path_factory.mktemp("bundle")
     script = [sys.executable, str(ROOT / "packaging/bundle.py"), "--output", str(folder), "--pythons", PYTHON]
     subprocess.run([*script, "amd64"], check=True, stdout=subprocess.DEVNULL)
+    (package,) = folder.iterdir()
+    package.rename(folder / BUNDLE)
+    _newer(folder / BUNDLE, folder / NEWER_BUNDLE, tmp_path_factory.mktemp("newer"))
     return folder
+
+
+def _newer(package: Path, newer: Path, folder: Path) -> None:
+    """Make a package of another one in which tsgt has another version."""
+    extract = ["dpkg-deb", "--raw-extract", package, folder]
+    subprocess.run(extract, check=True)
+    (wheel,) = folder.glob("usr/share/tsgt/wheels/tsgt-*.whl")
+    wheel.unlink()
+    installation.build_wheel(wheel.parent, version=NEWER)
+    control = folder / "DEBIAN/control"
+    control.write_text(re.sub("^Version: .*", f"Version: {NEWER}", control.read_text(), flags=re.MULTILINE))
+    command = ["dpkg-deb", "--root-owner-group", "-Znone", "--build", folder, newer]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 @pytest.fixture(scope="module")
 def bare(bare_image: Image, kvm: bool, bundle: Path, run_folder: Path) -> Iterator[Guest]:  # noqa: FBT001 (a fixture)
-    """Yield a guest without anything of tsgt, and with the bundle on a disk, as on a USB stick."""
+    """Yield a guest without anything of tsgt, and with the bundles on a disk, as on a USB stick."""
     folder = run_folder / "setup"
     folder.mkdir(parents=True)
-    disk = ["mke2fs", "-q", "-t", "ext4", "-L", "data", "-d", str(bundle), str(folder / "data.img"), "128M"]
+    disk = ["mke2fs", "-q", "-t", "ext4", "-L", "data", "-d", str(bundle), str(folder / "data.img"), "256M"]
     subprocess.run(disk, check=True)
     overlay = ["qemu-img", "create", "-q", "-f", "qcow2", "-F", "raw", "-b", str(bare_image.disk.resolve())]
     subprocess.run([*overlay, str(folder / "root.qcow2")], check=True)
@@ -72,20 +97,20 @@ def steps(guest: Guest, command: str) -> dict[str, dict[str, object]]:
 @pytest.fixture(scope="module")
 def installed(bare: Guest) -> Guest:
     """Install the bundle, and connect radios and instrument."""
-    began_s, began_here_s = uptime_s(bare), time.monotonic()
-    result = bare.run("dpkg -i /stick/*.deb", 900)
+    tell_uptime(bare, "installation begins")
+    began_here_s = time.monotonic()
+    result = bare.run(f"dpkg -i /stick/{BUNDLE}", 900)
     assert result.code == 0, result.out
-    took_s = time.monotonic() - began_here_s
-    print(f"installation: {uptime_s(bare) - began_s:.0f} s of the guest, {took_s:.0f} s here")  # noqa: T201
+    tell_uptime(bare, f"installed, in {time.monotonic() - began_here_s:.0f} s here,")
     installation.start_far_ends(bare)
     bare.plug_adapter()
     bare.wait(f"test -e {ADAPTER_PORT}", 30)
     return bare
 
 
-def test_one_sequence_leads_to_measurements(installed: Guest) -> None:
-    """Install, set up the master, take its mission to the station, set that up: then its measurements arrive."""
-    guest, began_s = installed, uptime_s(installed)
+def test_one_sequence_leads_to_poses(installed: Guest) -> None:
+    """Set up the master, take its mission to the stations, set these up, calibrate: then there are valid poses."""
+    guest = installed
     made = steps(guest, FIRST_MASTER)
     assert guest.output("grep -c ^dtparam=spi=on /boot/firmware/config.txt") == "1"
     assert "BCM 25" in str(made["radio"]["detail"])
@@ -94,7 +119,47 @@ def test_one_sequence_leads_to_measurements(installed: Guest) -> None:
     assert ADAPTER_PORT in str(made["instrument"]["detail"])
     assert guest.output("systemctl is-active tsgt-master tsgt-client").split() == ["active", "active"]
     guest.wait('grep -q \'"type":"measurement"\' /var/lib/tsgt/*.jsonl', 120)
-    print(f"setup to the first measurement: {uptime_s(guest) - began_s:.0f} s of the guest")  # noqa: T201
+    tell_uptime(guest, "first measurement at the master")
+    for station in OTHER_STATIONS:
+        other_pi(guest, station)
+    tell_uptime(guest, "three stations set up")
+    guest.push(field_notes.targets().encode(), "/root/targets.csv")
+    guest.push(field_notes.prisms().encode(), "/root/prisms.csv")
+    for command in CALIBRATION:
+        guest.output(command, 120)
+    tell_uptime(guest, "calibrated")
+    out = guest.output("timeout 120 tsgt listen --json --kind pose | grep -m 1 '\"valid\":true'", 150)
+    tell_uptime(guest, "first valid pose")
+    pose = json.loads(out)
+    centre_m = field_notes.SCENARIO.motion.area_centre_m
+    assert math.dist(pose["position_m"][:2], centre_m[:2]) < NEAR_M
+    print(out)  # noqa: T201
+
+
+def other_pi(guest: Guest, station: int) -> None:
+    """Set up a station on a copy of the file system without tsgt's files, and run it beside the others, with files of its own."""
+    root, layers = f"/srv/pi{station}", f"/run/pi{station}"
+    guest.output(
+        f"mkdir -p {root} {layers}/changes {layers}/work {layers}/run && "
+        f"mount -t overlay overlay -o lowerdir=/,upperdir={layers}/changes,workdir={layers}/work {root} && "
+        f"rm -rf {root}/etc/tsgt {root}/var/lib/tsgt && install -d -o tsgt -g tsgt {root}/var/lib/tsgt {layers}/run"
+    )
+    radio = f"--spi-device spidev{station}.0 --gpio-chip /dev/gpiochip{station}"
+    answers = f"--station {station} --prism-type mini_360 --mission mission.txt --instrument /run/instrument.{station}.tty"
+    assert steps(guest, f"tsgt setup station --root {root} --yes {radio} {answers}")["configuration"][
+        "changed"
+    ]
+    binds = f"{root}/etc/tsgt:/etc/tsgt {root}/var/lib/tsgt:/var/lib/tsgt {layers}/run:/run/tsgt"
+    unit = f"/run/systemd/system/tsgt-client{station}.service"
+    guest.push(f"[Service]\nBindPaths={binds}\n".encode(), f"{unit}.d/files.conf")
+    guest.output(
+        f"cp /usr/lib/systemd/system/tsgt-client.service {unit}; systemctl daemon-reload; systemctl start tsgt-client{station}"
+    )
+
+
+def tell_uptime(guest: Guest, what: str) -> None:
+    """Print the guest's time."""
+    print(f"{what}: {uptime_s(guest):.0f} s after the guest was switched on")  # noqa: T201
 
 
 def test_second_run_changes_nothing(installed: Guest) -> None:
@@ -108,6 +173,30 @@ def test_second_run_changes_nothing(installed: Guest) -> None:
         "find /etc /boot/firmware /lib/systemd -type f -newermt 2000-01-01 -printf '%p %C@\\n' | sort"
     )
     assert after == before
+
+
+def test_upgrade_restarts_what_runs(installed: Guest) -> None:
+    """The daemons run on until the new environment is complete, and are restarted once."""
+    pids = installed.output("systemctl show -P MainPID tsgt-master tsgt-client").split()
+    recorded = 'grep -h \'"type":"measurement"\' $(ls -t /var/lib/tsgt/master-*.jsonl | head -1) | tail -1'
+    installed.output("systemctl stop tsgt-client2 tsgt-client3")  # the package knows nothing of them
+    upgrade = f"dpkg -i /stick/{NEWER_BUNDLE} > /root/upgrade.log 2>&1; echo $? > /root/upgraded"
+    installed.output(f"systemd-run --quiet sh -c '{upgrade}'")
+    installed.wait("ls -d /opt/tsgt-??????/lib/*/site-packages/scipy | grep -c . | grep -q 2", 600)
+    last = json.loads(installed.output(recorded))
+    installed.wait(
+        f"[ $({recorded} | grep -o '\"sequence\":[0-9]*' | cut -d: -f2) -gt {last['sequence']} ]", 60
+    )
+    assert installed.output("systemctl show -P MainPID tsgt-master tsgt-client").split() == pids
+    installed.wait("test -e /root/upgraded", 600)
+    assert installed.output("cat /root/upgraded").strip() == "0", installed.output("cat /root/upgrade.log")
+    assert installed.output("systemctl is-active tsgt-master tsgt-client").split() == ["active", "active"]
+    assert installed.output("tsgt --version").split()[-1] == NEWER
+    assert len(installed.output("ls -d /opt/tsgt-??????").split()) == 1
+    installation.wait_for_measurements(installed, timeout_s=120)
+    newest = installed.output("head -1 $(ls -t /var/lib/tsgt/master-*.jsonl | head -1)")
+    assert json.loads(newest)["software"] == f"tsgt {NEWER}"
+    assert installed.output("systemctl show -P NRestarts tsgt-master tsgt-client").split() == ["0", "0"]
 
 
 def test_removal_leaves_configuration_and_recordings(installed: Guest) -> None:

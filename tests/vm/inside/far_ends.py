@@ -1,4 +1,4 @@
-"""Run in the guest: what is at the far ends of its wires. Two simulated radios on one channel, and total stations.
+"""Run in the guest: what is at the far ends of its wires. Simulated radios on one channel, and total stations.
 
 Commands are lines written to the pipe ``/run/far_ends``:
 
@@ -18,6 +18,7 @@ import json
 import os
 import struct
 import sys
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ from tsgt.simulation.lora import Air, LinkModel, LogDistanceLoss, SX1276Chip
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
+    from tsgt.config import SimulatedStation
     from tsgt.simulation.lora.air import Transceiver
     from tsgt.simulation.lora.frames import Frame, FrameListener
 
@@ -40,9 +42,16 @@ STATE = Path("/run/far_ends.json")
 REPORT = "/dev/virtio-ports/report"
 ADAPTER = "/dev/virtio-ports/adapter"
 TERMINAL = Path("/run/instrument.tty")
+"""Of a second instrument of station 1; those of the others have its number before the suffix."""
 
-PLACES = {"client": (0.0, 0.0, 0.0), "master": (50.0, 0.0, 0.0)}
-"""Of the radios 0 and 1, in m."""
+SCENARIO = ScenarioConfig(motion=MotionConfig(speeds_mps=(0.0,), speed_weights=(1.0,)))
+
+PLACES = {
+    "client": SCENARIO.stations[0].position_m,
+    "master": SCENARIO.motion.area_centre_m,
+    **{f"client {each.station}": each.position_m for each in SCENARIO.stations[1:]},
+}
+"""Of the radios, by their number, in m."""
 
 RESET, DIO0, NSS = 17, 4, 25  # as on the Dragino HAT
 BAUD = 115_200
@@ -188,14 +197,14 @@ async def main() -> None:
 
     radios = [Radio(number, chip(name)) for number, name in enumerate(PLACES)]
 
-    scenario = ScenarioConfig(motion=MotionConfig(speeds_mps=(0.0,), speed_weights=(1.0,)))
-    world = scenario_world(scenario, WORLD_S, np.random.default_rng(3))
+    world = scenario_world(SCENARIO, WORLD_S, np.random.default_rng(3))
 
-    def instrument() -> SimulatedTotalStation:
-        rng, now_ns = np.random.default_rng(4), timeline.now_ns()
-        return SimulatedTotalStation(scenario.stations[0], scenario, world, timeline, rng, start_ns=now_ns)
+    def instrument(station: SimulatedStation) -> SimulatedTotalStation:
+        rng, now_ns = np.random.default_rng(4 + station.station), timeline.now_ns()
+        return SimulatedTotalStation(station, SCENARIO, world, timeline, rng, start_ns=now_ns)
 
-    Line(instrument(), timeline)
+    first, *others = SCENARIO.stations
+    Line(instrument(first), timeline)
     os.mkfifo(COMMANDS)
     commands = os.open(COMMANDS, os.O_RDWR | os.O_NONBLOCK)  # open for writing as well: it never ends
 
@@ -204,8 +213,11 @@ async def main() -> None:
             obey(line, radios)
 
     loop.add_reader(commands, read_commands)
-    async with PtyLine(instrument(), TERMINAL):
-        os.chmod(TERMINAL, 0o666)  # noqa: PTH101, S103 (no waiting; the service is another user)
+    terminals = {TERMINAL: first} | {TERMINAL.with_suffix(f".{each.station}.tty"): each for each in others}
+    async with AsyncExitStack() as stack:
+        for path, station in terminals.items():
+            await stack.enter_async_context(PtyLine(instrument(station), path))
+            os.chmod(path, 0o666)  # noqa: PTH101, S103 (no waiting; the service is another user)
         print("ready", flush=True)  # noqa: T201
         await asyncio.Event().wait()
 

@@ -1,12 +1,15 @@
 """Would the checkers see a defect? Defects planted in the program one by one, and which check or test finds each.
 
-    python benchmarks/run.py planted_defects [NAMES ...] [--seeds N]
+    python benchmarks/run.py planted_defects [NAMES ...] [--seeds N] [--from FILE]
 
 A defect is a wrong function in the place of a right one, for as long as its missions run and are checked: nothing is
 edited, and the checkers run with the defect, as they would if it were in the program. Each runs short simulated
 missions with the faults that make it show, one seed after the other, until a checker sees it. Where no checker can, as
 nobody in the simulation is clever enough to make use of it, a test is run with the defect instead. Ends with 3 when one is
 not found.
+
+`--from` takes the defects from another file, a Python module with a dictionary ``DEFECTS`` like the one below;
+docs/explanation/faults.md has an example.
 """
 
 from __future__ import annotations
@@ -14,8 +17,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import errno
+import inspect
 import logging
 import os
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -36,10 +41,12 @@ from tsgt.simulation.faults import FAST_SYNC_CYCLES, FaultKind
 from tsgt.simulation.mission import MASTER
 from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
+from tsgt.simulation.scenario_files import with_stations
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
+    from tsgt.config import ImuModelName
     from tsgt.simulation.mission import Mission
 
 TESTS = Path(__file__).parents[1] / "tests"
@@ -60,8 +67,8 @@ class Defect:
         Does it.
     faults
         Kinds of faults with which it shows.
-    protocol, estimator, duration_s, drift_ppm
-        Of the missions.
+    protocol, estimator, duration_s, drift_ppm, imu, stations
+        Of the missions. Fewer than three stations need an IMU.
     script
         Runs while the daemons run.
     test
@@ -75,6 +82,8 @@ class Defect:
     estimator: Literal["linear", "continuous"] = "linear"
     duration_s: float = 60.0
     drift_ppm: float = 10.0
+    imu: ImuModelName = "none"
+    stations: int = 3
     script: Callable[[Mission], Coroutine[None, None, None]] | None = None
     test: str = ""
 
@@ -251,7 +260,10 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
     found = Found()
     plain = ScenarioConfig()
     pipeline = plain.pipeline.model_copy(update={"estimator": defect.estimator})
-    scenario = plain.model_copy(update={"pipeline": pipeline})
+    robot = plain.imu.model_copy(update={"model": defect.imu})
+    scenario = plain.model_copy(update={"pipeline": pipeline, "imu": robot})
+    if defect.stations < len(scenario.stations):
+        scenario = with_stations(scenario, defect.stations)
     protocol = (
         SuperframeMasterConfig(kind="superframe")
         if defect.protocol == "superframe"
@@ -273,7 +285,7 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
                 run = simulate(scenario, options, folder=Path(folder), script=defect.script)
                 seen = check_invariants(run)
             except Exception as error:  # (a daemon or a checker that falls over is seen as well)
-                if _is_ours(error):
+                if _is_ours(error, defect):
                     raise
                 found.checks["died"] += 1
                 found.example = repr(error)
@@ -287,12 +299,18 @@ def hunt(defect: Defect, seeds: int = SEEDS) -> Found:
     return found
 
 
-def _is_ours(error: BaseException) -> bool:
+def _is_ours(error: BaseException, defect: Defect) -> bool:
     """Whether it is the planting that fell over."""
     if isinstance(error, BaseExceptionGroup):
-        return any(map(_is_ours, error.exceptions))
+        return any(_is_ours(each, defect) for each in error.exceptions)
     frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and frames[-1].filename == defects.__file__
+    return bool(frames) and frames[-1].filename in (defects.__file__, inspect.getsourcefile(defect.plant))
+
+
+def read_defects(path: Path) -> dict[str, Defect]:
+    """Return the defects of a file."""
+    found: dict[str, Defect] = runpy.run_path(str(path))["DEFECTS"]
+    return found
 
 
 def fails(key: str) -> bool:
@@ -318,18 +336,22 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", nargs="*", choices=[*DEFECTS, []], help="which (default: all)")
+    parser.add_argument("names", nargs="*", help="which (default: all)")
+    parser.add_argument("--from", dest="file", type=Path, help="Python file with other defects")
     parser.add_argument(
         "--seeds", type=int, default=SEEDS, help=f"missions of each at most (default: {SEEDS})"
     )
     parser.add_argument("-v", "--verbose", action="store_true", help="also the first violation of each")
     arguments = parser.parse_args()
+    known = DEFECTS if arguments.file is None else read_defects(arguments.file)
+    if unknown := set(arguments.names) - set(known):
+        parser.error(f"no defect {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     configure_logging("critical")
     logging.disable(logging.CRITICAL)  # asyncio's, of daemons that are killed
     print("| defect | protocol, estimator | faults | seen by | after, s |\n|---|---|---|---|---|")
     missed = 0
-    for key in arguments.names or DEFECTS:
-        defect = DEFECTS[key]
+    for key in arguments.names or known:
+        defect = known[key]
         if defect.test:
             seen = f"`{defect.test}`" if fails(key) else ""
             print(f"| {defect.name} | | | {seen or '**nothing**'} | |", flush=True)

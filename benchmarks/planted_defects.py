@@ -246,6 +246,9 @@ DEFECTS: Final = {
     "age-continuous": Defect(
         "the same, continuous", defects_published.publish_age_zero, estimator="continuous"
     ),
+    "skipped-line": Defect("readers do not get every line", defects_published.skip_streamed_line),
+    "velocity": Defect("velocities have the wrong sign", defects_published.reverse_velocities),
+    "epoch": Defect("epochs are left out", defects_published.skip_epoch),
     "queue": Defect(
         "a reader's queue has no bound", defects.unbound_reader_queue, script=sleeping_reader, duration_s=122
     ),

@@ -16,6 +16,7 @@ from tsgt.estimation.pose_batch import PoseBatch
 from tsgt.master.classic import ingest
 from tsgt.master.recording_thread import RecordingThread
 from tsgt.master.statistics import Statistics
+from tsgt.master.stream_server import StreamServer
 from tsgt.simulation.mission import mission
 from tsgt.station.links import superframe as station_link
 
@@ -67,6 +68,46 @@ def record_other_digit(planting: Planting) -> None:
         return defective
 
     planting.replace_attribute(RecordingThread, "put", put)
+
+
+def skip_streamed_line(planting: Planting) -> None:
+    """Send every hundredth line to no reader."""
+    count = 0
+
+    def publish(original: Any) -> Any:
+        def defective(server: Any, line: bytes) -> None:
+            nonlocal count
+            count += 1
+            if count % 100:
+                original(server, line)
+
+        return defective
+
+    planting.replace_attribute(StreamServer, "publish", publish)
+
+
+def reverse_velocities(planting: Planting) -> None:
+    """Publish velocities with the wrong sign."""
+
+    def records(original: Any) -> Any:
+        def defective(batch: Any) -> Any:
+            return original(replace(batch, velocity_mps=-batch.velocity_mps))
+
+        return defective
+
+    planting.replace_attribute(PoseBatch, "records", records)
+
+
+def skip_epoch(planting: Planting) -> None:
+    """Publish no pose for every hundredth epoch."""
+
+    def records(original: Any) -> Any:
+        def defective(batch: Any) -> Any:
+            return (pose for pose in original(batch) if pose.stamp_ns // 50_000_000 % 100)
+
+        return defective
+
+    planting.replace_attribute(PoseBatch, "records", records)
 
 
 def lose_polled_measurement(planting: Planting) -> None:

@@ -23,7 +23,7 @@ from tsgt.simulation.faults import (
     relock_instruments,
 )
 from tsgt.simulation.kernel import VirtualTimeline, run_virtual
-from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult, Slew, has_odometry
+from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult, Slew, has_odometry, listen_to_stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -78,6 +78,7 @@ def simulate(
         mission.start_master()
         scenario_tasks = [
             *([script(mission)] if script is not None else []),
+            listen_to_stream(mission),
             *(mission.apply_outage(outage) for outage in options.outages),
             *(mission.restart(restart.station, restart.at_s) for restart in options.restarts),
             *(

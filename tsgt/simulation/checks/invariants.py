@@ -19,6 +19,7 @@ from tsgt.recording import load_recording
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.covariance_scale import scale_failures
 from tsgt.simulation.checks.expected_poses import missing_poses
+from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.imu_samples import imu_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.odometry_samples import odometry_failures
@@ -95,6 +96,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
     found += (Violation("liveness", what) for what in missing_poses(result))
     for master_log in result.master_logs:
         found += (Violation("recording", what) for what in recording_failures(master_log))
+        found += (Violation("stream", what) for what in heard_failures(master_log))
         found += (Violation("status", what) for what in status_failures(master_log))
         found += (Violation("lost", what) for what in unpublished_replies(master_log))
         found += (Violation("pose", what) for what in age_failures(master_log, result.parameters))

@@ -15,6 +15,7 @@ from tsgt.simulation.mission.run_log import (
     StationLog,
     ValidPoses,
 )
+from tsgt.simulation.mission.stream_listener import listen_to_stream
 
 __all__ = [
     "DRAIN_S",
@@ -28,5 +29,6 @@ __all__ = [
     "ValidPoses",
     "has_odometry",
     "instrument_config",
+    "listen_to_stream",
     "station_name",
 ]

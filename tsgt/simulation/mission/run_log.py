@@ -132,6 +132,7 @@ class MasterLog:
         self.frames_duration_ns = 0
         self._first_beacon: BeaconRecord | None = None
         self.line_hashes = array("q")
+        self.heard: list[array[int]] = []  # hashes of the lines that a reader got, by connection
         self._pose_stamps = array("q")
         self._pose_measurements_before = array("q")
         self._series: dict[str, int] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from tsgt.radio.classic import OK, MeasurementMessage
 from tsgt.recording import StationStatus, encode_line
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.expected_poses import missing_poses
+from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
 from tsgt.simulation.checks.pose_ages import age_failures
 from tsgt.simulation.checks.recorded_lines import recording_failures
@@ -55,6 +57,25 @@ def test_recording_that_ends_early(tmp_path: Path, *, crashed: bool) -> None:
     whole = b"".join(encode_line(record) + b"\n" for record in (HEADER, PARAMETERS, measurement(0), POSE))
     (tmp_path / "a.jsonl").write_bytes(whole[:-9])
     assert bool(list(recording_failures(log))) != crashed
+
+
+@pytest.mark.parametrize(
+    ("heard", "count"),
+    [
+        ([0, 3, 4, 5], 0),
+        ([0, 3, 4, 6], 1),
+        ([0, 3, 4, 4], 1),
+        ([0, 3, 4, 9], 1),
+        ([0, 9, 4], 1),
+        ([0, 3], 0),
+        ([], 0),
+    ],
+)
+def test_lines_that_a_reader_got(tmp_path: Path, heard: list[int], count: int) -> None:
+    """Line 0 is a greeting, 3 the set-up, 4 to 6 follow, 9 is unknown."""
+    log = _log(tmp_path)
+    log.line_hashes, log.heard = array("q", [3, 4, 5, 6]), [array("q", heard)]
+    assert len(list(heard_failures(log))) == count
 
 
 def _status(**changes: Any) -> Any:

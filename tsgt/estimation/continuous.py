@@ -85,7 +85,7 @@ class ContinuousEstimator:
         self._next_smoothed_ns = 0
         self._first_epoch_ns = 0
         # The oldest epoch first. The window still has the states: a delay is below the lag.
-        self._delays_ns = np.array(sorted(self._limits.smoothed_delays_ns, reverse=True), dtype=np.int64)
+        self._delays_ns = sorted(self._limits.smoothed_delays_ns, reverse=True)
         self.outside_lag_window: Counter[int] = Counter()
         self._none = PoseBatch.blank(none, tuple(self._columns), Kind.PREDICTED)
 
@@ -153,7 +153,7 @@ class ContinuousEstimator:
             due_ns = range(epoch_ns, min(now_ns + 1, next_smoothing_ns), period_ns)
             if self._imu is not None:
                 due_ns = due_ns[:1]  # the IMU may have fallen silent since
-            batches.append(self._with_delayed(self._predicted(due_ns, jump_from)))
+            batches.append(self._due(due_ns, jump_from))
             self._next_epoch_ns = due_ns[-1] + period_ns
         return PoseBatch.concatenated(batches or [self._none])
 
@@ -223,31 +223,67 @@ class ContinuousEstimator:
             history.unusable_ns,
         )
 
-    def _predicted(self, epochs_ns: range, jump_from: States | None) -> PoseBatch:
+    def _due(self, epochs_ns: range, jump_from: States | None) -> PoseBatch:
+        """Return the predicted poses of epochs, each after the smoothed ones whose delay has passed with it."""
+        period_ns = self._limits.period_ns
+        stamps_ns, delays_ns, sent_ns = [], [], []
+        for epoch_ns in epochs_ns:
+            for delay_ns in (*self._delays_ns, 0):
+                stamp_ns = epoch_ns - -(-delay_ns // period_ns) * period_ns
+                if stamp_ns >= self._first_epoch_ns:
+                    stamps_ns.append(stamp_ns)
+                    delays_ns.append(delay_ns)
+                    sent_ns.append(epoch_ns)
+        rows = stamps_ns, delays_ns, sent_ns
         if not self._window.initialised:
-            return self._with_imu_use(self._poses.predicted(epochs_ns, self._history, None, _NONE))
-        time_s = (np.array(epochs_ns, dtype=np.int64) - self._origin_ns) / 1e9
-        converged = np.full(len(time_s), self._window.converged and not self._window.ambiguous)
-        ambiguous = self._window.recently_ambiguous_at(time_s)
-        found = [self._window.predict(each_s, dim=_POSE_DIM) for each_s in time_s.tolist()]
-        added = [self._window.common_at(each_s, dim=_POSE_DIM) for each_s in time_s.tolist()]
-        common = [each for each in added if each is not None]
-        states, covariance = found[0]
-        if len(found) > 1:
-            states = concatenate_states([state for state, _ in found])
-            covariance = np.concatenate([each for _, each in found])
-        batch = self._poses.predicted(
-            epochs_ns,
+            return self._with_imu_use(self._poses.due(*rows, self._history, None, _NONE))
+        time_s = (np.array(stamps_ns, dtype=np.int64) - self._origin_ns) / 1e9
+        predicted = np.equal(delays_ns, 0)
+        converged = np.where(
+            predicted,
+            self._window.converged and not self._window.ambiguous,
+            self._converged_at(time_s),
+        )
+        states, covariance, common = self._states_at(time_s, predicted)
+        batch = self._poses.due(
+            *rows,
             self._history,
             states,
             self._with_allowance(covariance),
-            common=np.concatenate(common) if common else None,
+            common=common,
             converged=converged,
-            ambiguous=ambiguous,
+            ambiguous=self._window.recently_ambiguous_at(time_s),
         )
         if jump_from is not None:
-            batch.jump[0] = self._poses.distance(jump_from, states.select(slice(1)))
+            first = int(np.argmax(predicted))
+            batch.jump[first] = self._poses.distance(jump_from, states.select(slice(first, first + 1)))
         return self._with_imu_use(batch)
+
+    def _states_at(
+        self, time_s: FloatArray, predicted: NDArray[np.bool_]
+    ) -> tuple[States, FloatArray, FloatArray | None]:
+        """Return states, their covariance and its common part at times that are predicted, or smoothed."""
+        found = [self._window.predict(each_s, dim=_POSE_DIM) for each_s in time_s[predicted].tolist()]
+        common = [self._window.common_at(each_s, dim=_POSE_DIM) for each_s in time_s[predicted].tolist()]
+        if not predicted.all():
+            trajectory = self._window.smoothed_trajectory()
+            found.append(trajectory.at(time_s[~predicted], dim=_POSE_DIM))
+            common.append(trajectory.common_at(time_s[~predicted], dim=_POSE_DIM))
+        known = [each for each in common if each is not None]
+        if len(found) == 1:
+            return *found[0], known[0] if known else None
+        order = np.argsort(np.concatenate([np.flatnonzero(predicted), np.flatnonzero(~predicted)]))
+        return (
+            concatenate_states([states for states, _ in found]).select(order),
+            np.concatenate([covariance for _, covariance in found])[order],
+            np.concatenate(known)[order] if known else None,
+        )
+
+    def _converged_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Whether the trajectory is reliable at times, (N,), that have been smoothed."""
+        reliable = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)
+        reliable &= ~self._window.ambiguous_at(time_s)
+        return np.asarray(reliable & self._window.converged)
 
     def _with_imu_use(self, batch: PoseBatch) -> PoseBatch:
         """Fill in whether poses rest on the IMU."""
@@ -265,22 +301,6 @@ class ContinuousEstimator:
         unconfirmed = self._imu is not None and self._imu.unconfirmed
         return covariance + np.diag(UNCONFIRMED_SIGMAS**2) if unconfirmed else covariance
 
-    def _with_delayed(self, predicted: PoseBatch) -> PoseBatch:
-        """Return predicted poses, each after the smoothed ones whose delay has passed with its epoch."""
-        if not len(self._delays_ns):
-            return predicted
-        period_ns = self._limits.period_ns
-        sent_ns = np.repeat(predicted.stamp_ns, len(self._delays_ns))
-        delay_ns = np.tile(self._delays_ns, len(predicted))
-        stamp_ns = sent_ns - -(-delay_ns // period_ns) * period_ns
-        begun = stamp_ns >= self._first_epoch_ns
-        if not begun.any():
-            return predicted
-        sent_ns, delay_ns, stamp_ns = sent_ns[begun], delay_ns[begun], stamp_ns[begun]
-        delayed = replace(self._smoothed(stamp_ns, sent_ns), delay_ns=delay_ns)
-        order = np.argsort(np.concatenate([sent_ns, predicted.stamp_ns]), kind="stable")
-        return PoseBatch.concatenated([delayed, predicted]).select(order)
-
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
         """Return the smoothed poses of the epochs up to an instant, and discard what only they needed."""
         stamp_ns = np.arange(self._next_smoothed_ns, last_ns + 1, self._limits.period_ns, dtype=np.int64)
@@ -291,8 +311,8 @@ class ContinuousEstimator:
         self._discard_old()
         return poses
 
-    def _smoothed(self, stamp_ns: NDArray[np.int64], sent_ns: NDArray[np.int64] | None = None) -> PoseBatch:
-        """Return the smoothed poses of epochs in the window; ``sent_ns``: when each is sent, if before the lag."""
+    def _smoothed(self, stamp_ns: NDArray[np.int64]) -> PoseBatch:
+        """Return the smoothed poses of epochs in the window, as far as they are final."""
         states: States | None = None
         covariance = _NONE
         common: FloatArray | None = None
@@ -301,8 +321,6 @@ class ContinuousEstimator:
             trajectory = self._window.smoothed_trajectory()
             states, covariance = trajectory.at(time_s, dim=_POSE_DIM)
             common = trajectory.common_at(time_s, dim=_POSE_DIM)
-        reliable = (time_s >= self._window.reliable_from_s) & (time_s < self._window.ambiguous_from_s)
-        reliable &= ~self._window.ambiguous_at(time_s)
         return self._with_imu_use(
             self._poses.smoothed(
                 stamp_ns,
@@ -310,9 +328,8 @@ class ContinuousEstimator:
                 states,
                 self._with_allowance(covariance),
                 common=common,
-                converged=reliable & self._window.converged,
+                converged=self._converged_at(time_s),
                 ambiguous=self._window.recently_ambiguous_at(time_s),
-                now_ns=sent_ns,
             )
         )
 

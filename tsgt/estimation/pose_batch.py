@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum, IntFlag
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -166,7 +166,7 @@ class PoseBatch:
 
     @classmethod
     def _arrays(cls) -> list[str]:
-        return [f.name for f in fields(cls) if f.name not in ("prisms", "reference_point")]
+        return [name for name in cls.__slots__ if name not in ("prisms", "reference_point")]
 
     def __len__(self) -> int:
         return len(self.stamp_ns)

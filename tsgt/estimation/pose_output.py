@@ -28,6 +28,18 @@ if TYPE_CHECKING:
 MAX_ROTATION_SIGMA_RAD = 0.5  # a pose whose rotation has a larger sigma is not computed
 
 _NEVER_NS = -(2**61)
+# Plain numbers, which numpy compares and assigns several times as fast
+_VALID, _TILT, _RESIDUAL, _UNCERTAIN, _OUTAGE, _STATION_STATUS = (
+    int(each)
+    for each in (
+        Reason.VALID,
+        Reason.TILT,
+        Reason.RESIDUAL,
+        Reason.UNCERTAIN,
+        Reason.OUTAGE,
+        Reason.STATION_STATUS,
+    )
+)
 
 
 class PrismHistory(NamedTuple):
@@ -78,11 +90,13 @@ class ContinuousPoseOutput:
         ]
         self._to_origin_m = -centroid_m(parameters)
         self._reference_point = parameters.reference_point
-        self._undetermined = Reason.DEGENERATE_GEOMETRY if parameters.imu is None else Reason.UNCERTAIN
+        self._undetermined = int(Reason.DEGENERATE_GEOMETRY if parameters.imu is None else Reason.UNCERTAIN)
 
-    def predicted(
+    def due(
         self,
         stamps_ns: Sequence[int],
+        delays_ns: Sequence[int],
+        sent_ns: Sequence[int],
         history: MeasurementHistory,
         states: States | None,
         covariance: NDArray[np.float64],
@@ -91,18 +105,28 @@ class ContinuousPoseOutput:
         converged: NDArray[np.bool_] | None = None,
         ambiguous: NDArray[np.bool_] | None = None,
     ) -> PoseBatch:
-        """Return poses from earlier measurements, as :meth:`smoothed`; live a single epoch is looked up without arrays."""
-        batch = PoseBatch.blank(np.array(stamps_ns, dtype=np.int64), self._prisms, Kind.PREDICTED)
-        for row, stamp_ns in enumerate(stamps_ns):
-            for column, home_station in enumerate(self._home_station):
+        """Return the poses that are due live, a few at a time, whose measurements are looked up without arrays.
+
+        A pose with a delay is one of :meth:`smoothed` that is sent at ``sent_ns``, before it is final: the next measurement
+        of a prism must have arrived by then, unless the last one is within the outage limit, and a pose without any
+        measurement from its epoch on is not computed. One without a delay is predicted from earlier measurements.
+        """
+        batch = PoseBatch.blank(np.array(stamps_ns, dtype=np.int64), self._prisms, Kind.SMOOTHED)
+        batch.delay_ns[:] = delays_ns
+        batch.kind[np.equal(batch.delay_ns, 0)] = Kind.PREDICTED
+        for row, (stamp_ns, delay_ns, now_ns) in enumerate(zip(stamps_ns, delays_ns, sent_ns, strict=True)):
+            for column, (prism, home_station) in enumerate(
+                zip(history.by_prism, self._home_station, strict=True)
+            ):
                 (
                     batch.station[row, column],
                     batch.age_s[row, column],
                     batch.prism_residual_m[row, column],
                     batch.prism_reason[row, column],
-                ) = self._latest(history.by_prism[column], home_station, stamp_ns)
+                ) = self._describe_one(prism, home_station, stamp_ns, now_ns if delay_ns else None)
+        known = np.equal(batch.delay_ns, 0) | (batch.stamp_ns <= history.times_ns.max(initial=_NEVER_NS))
         return self._with_poses(
-            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous
+            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous, known=known
         )
 
     def smoothed(
@@ -115,7 +139,6 @@ class ContinuousPoseOutput:
         common: NDArray[np.float64] | None = None,
         converged: NDArray[np.bool_] | None = None,
         ambiguous: NDArray[np.bool_] | None = None,
-        now_ns: NDArray[np.int64] | None = None,
     ) -> PoseBatch:
         """Return poses of the reference point from measurements on both sides of their epochs.
 
@@ -136,19 +159,12 @@ class ContinuousPoseOutput:
             (N,) whether the trajectory is reliable there; no other pose is valid. Default: everywhere.
         ambiguous
             (N,) whether the state was ambiguous shortly before, which degrades a pose. Default: nowhere.
-        now_ns
-            (N,) instants by which the next measurement of a prism must have arrived, unless the last one is within the
-            outage limit of them. A pose without any measurement from its epoch on is not computed. Default: at the end of
-            time.
         """
         batch = PoseBatch.blank(stamp_ns, self._prisms, Kind.SMOOTHED)
         for column in range(len(self._prisms)):
-            self._describe(batch, column, history, now_ns)
-        known = None
-        if now_ns is not None:
-            known = stamp_ns <= history.times_ns.max(initial=_NEVER_NS)
+            self._describe(batch, column, history)
         return self._with_poses(
-            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous, known=known
+            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous
         )
 
     def distance(self, before: States, after: States) -> tuple[float, float]:
@@ -158,31 +174,39 @@ class ContinuousPoseOutput:
         turned = log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
         return float(np.linalg.norm(moved)), float(np.linalg.norm(turned))
 
-    def _latest(
-        self, prism: PrismHistory, home_station: int, epoch_ns: int
-    ) -> tuple[int, float, float, Reason]:
-        """Return station and age of a prism's last measurement before an epoch, its residual and its reason."""
-        latest = bisect.bisect_right(prism.times_ns, epoch_ns) - 1
+    def _describe_one(
+        self, prism: PrismHistory, home_station: int, epoch_ns: int, now_ns: int | None
+    ) -> tuple[int, float, float, int]:
+        """Return station and age of a prism's last measurement before an epoch, its residual and its reason.
+
+        ``now_ns``: when a smoothed pose is sent; None: a predicted one.
+        """
+        times_ns, residuals_m = prism.times_ns, prism.residuals_m
+        latest = bisect.bisect_right(times_ns, epoch_ns) - 1
         station, age_s, since_ns = home_station, math.nan, _NEVER_NS
         if latest >= 0:
-            station, since_ns = prism.stations[latest], prism.times_ns[latest]
+            station, since_ns = prism.stations[latest], times_ns[latest]
             age_s = (epoch_ns - since_ns) / 1e9
-            if epoch_ns - since_ns <= self._limits.outage_limit_ns:
-                first, second, last = (prism.residuals_m[max(latest - back, 0)] for back in (2, 1, 0))
-                # The median; NaN where one is unknown.
-                median = max(min(first, second), min(max(first, second), last))
-                return station, age_s, median if first + second + last >= 0 else math.nan, Reason.VALID
+        if now_ns is None:
+            until_ns, near = epoch_ns, (latest - 2, latest - 1, latest)
+        else:
+            following = bisect.bisect_left(times_ns, epoch_ns)
+            until_ns, nearest = now_ns, latest
+            if following < len(times_ns):
+                until_ns = times_ns[following]
+                nearest = following if until_ns - epoch_ns < epoch_ns - since_ns else latest
+            near = (nearest - 1, nearest, min(nearest + 1, len(times_ns) - 1))
+        if until_ns - since_ns <= self._limits.outage_limit_ns:
+            # The median of three: a single large residual is an outlier, two are a wrong pose or set-up.
+            first, second, last = (residuals_m[max(each, 0)] for each in near)
+            median = max(min(first, second), min(max(first, second), last))
+            # NaN where one is unknown.
+            return station, age_s, median if first + second + last >= 0 else math.nan, _VALID
         newest = bisect.bisect_right(prism.unusable_ns, epoch_ns) - 1
         unusable = newest >= 0 and prism.unusable_ns[newest] > since_ns
-        return station, age_s, math.nan, Reason.STATION_STATUS if unusable else Reason.OUTAGE
+        return station, age_s, math.nan, _STATION_STATUS if unusable else _OUTAGE
 
-    def _describe(
-        self,
-        batch: PoseBatch,
-        column: int,
-        history: MeasurementHistory,
-        now_ns: NDArray[np.int64] | None,
-    ) -> None:
+    def _describe(self, batch: PoseBatch, column: int, history: MeasurementHistory) -> None:
         """Fill in station and age of a prism's last measurement, its residual and its reason."""
         epochs_ns, unusable_ns = batch.stamp_ns, history.unusable_ns[column]
         rows = np.flatnonzero(history.prisms == column)
@@ -199,14 +223,12 @@ class ContinuousPoseOutput:
         until_ns = np.full(len(epochs_ns), -_NEVER_NS)
         until_ns[inside] = times_ns[following[inside]]
         nearest = np.where(until_ns - epochs_ns < epochs_ns - since_ns, following, latest)
-        if now_ns is not None:
-            until_ns = np.where(inside, until_ns, now_ns)
         out = until_ns - since_ns > self._limits.outage_limit_ns
-        batch.prism_reason[out, column] = Reason.OUTAGE
+        batch.prism_reason[out, column] = _OUTAGE
         if len(unusable_ns):
             newest = np.searchsorted(unusable_ns, epochs_ns, side="right") - 1
             unusable = out & (newest >= 0) & (unusable_ns[newest] > since_ns)
-            batch.prism_reason[unusable, column] = Reason.STATION_STATUS
+            batch.prism_reason[unusable, column] = _STATION_STATUS
         # The median of three: a single large residual is an outlier, two are a wrong pose or set-up.
         near = rows[np.minimum(np.maximum(nearest[~out] + np.arange(-1, 2)[:, None], 0), len(rows) - 1)]
         first, second, last = history.residuals_m[near]
@@ -264,13 +286,13 @@ class ContinuousPoseOutput:
         sigmas = np.column_stack([worst_sigma(batch.covariance[:, :3, :3]), sigma_rad])
         # Rounding may make a variance negative; its sigma is NaN, which is below no limit.
         uncertain = unknown | ~(sigmas <= sigma_limits(batch.kind, limits)).all(axis=1)
-        batch.reason[rotation[:, 2, 2] <= math.cos(limits.tilt_limit_rad)] = Reason.TILT
-        batch.reason[batch.residual_m > limits.residual_limit_m] = Reason.RESIDUAL
+        batch.reason[rotation[:, 2, 2] <= math.cos(limits.tilt_limit_rad)] = _TILT
+        batch.reason[batch.residual_m > limits.residual_limit_m] = _RESIDUAL
         if converged is not None:
-            batch.reason[~converged & (batch.reason == Reason.VALID)] = Reason.UNCERTAIN
+            batch.reason[~converged & (batch.reason == _VALID)] = _UNCERTAIN
         if uncertain.any():
             # A wrong layout makes poses uncertain too: its outliers have little weight.
-            present = np.where(batch.reason == Reason.RESIDUAL, Reason.RESIDUAL, Reason.UNCERTAIN)
+            present = np.where(batch.reason == _RESIDUAL, _RESIDUAL, _UNCERTAIN)
             batch.reason[uncertain] = np.where(missing, missing, present)[uncertain]
         batch.degraded[:] = degradations(batch, sigmas, limits, ambiguous=ambiguous)
         return batch

@@ -25,3 +25,24 @@ def test_negative_variance_is_not_valid() -> None:
     poses = ContinuousPoseOutput(parameters).smoothed(stamp_ns, SEEN, states, covariance)
     assert poses.valid.tolist() == [True, False]
     assert poses.reason[1] == Reason.OUTAGE
+
+
+def test_few_poses_are_described_as_many() -> None:
+    """Live, without arrays, as in a batch: ages, residuals, outages and failed measurements of each prism."""
+    parameters = stationary_scene().with_limits(estimator="continuous").parameters
+    rng = np.random.default_rng(3)
+    times_ns = START + np.sort(rng.integers(0, 60 * SECOND, 90)) // 10**8 * 10**8
+    prisms = rng.integers(0, 3, 90).astype(np.intp)
+    residuals_m = np.where(rng.random(90) < 0.1, np.nan, rng.random(90))
+    unusable_ns = [np.array([START + 5 * SECOND]), NONE, START + np.arange(0, 60, 7) * SECOND]
+    history = MeasurementHistory(times_ns, 4 + prisms, prisms, residuals_m, unusable_ns)
+    stamp_ns = START + np.arange(-10, 500) * SECOND // 10
+    sent_ns = np.maximum(stamp_ns, times_ns[-1]) + 100 * SECOND  # so late that nothing can come any more
+    output = ContinuousPoseOutput(parameters)
+    none = np.empty((0, 6, 6))
+    many = output.smoothed(stamp_ns, history, None, none)
+    delays_ns = sent_ns - stamp_ns
+    few = output.due(stamp_ns.tolist(), delays_ns.tolist(), sent_ns.tolist(), history, None, none)
+    for name in ("station", "age_s", "prism_residual_m", "prism_reason", "reason"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(many, name), err_msg=name)
+    assert set(np.unique(many.prism_reason)) == {Reason.VALID, Reason.OUTAGE, Reason.STATION_STATUS}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, f
+from scipy.special import chdtri, fdtri
 
 from tsgt.geometry.polar import cartesian_to_polar
 from tsgt.geometry.rest.factors import RestInterval
@@ -224,7 +224,8 @@ class _Windows:
         scatter = np.maximum(variance, MIN_SCATTER)
         return _Statistics(
             trend,
-            scatter * trends * f.isf(TREND_SIGNIFICANCE, trends, remaining),
+            # The quantiles of F and chi-square themselves: the checks of scipy.stats cost several times as much.
+            scatter * trends * fdtri(trends, remaining, 1.0 - TREND_SIGNIFICANCE),
             about_mean,
             total(steps),
             freedom,
@@ -306,7 +307,7 @@ def _moved_from(part: Series) -> int:
         place = np.searchsorted(outer, end)
         distance[place < len(outer)] += each[place[place < len(outer)]]
         freedom[place < len(outer)] += 3
-    moved = distance > chi2.isf(END_SIGNIFICANCE, np.maximum(freedom, 1))
+    moved = distance > chdtri(np.maximum(freedom, 1), END_SIGNIFICANCE)
     return int(end[np.argmax(moved)]) if moved.any() else len(part)
 
 

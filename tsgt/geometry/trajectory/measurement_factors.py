@@ -7,7 +7,7 @@ of the zenith angle), so that neither the circle's zero nor the vertical is sing
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -176,7 +176,7 @@ def merge_observations(held: Observations | None, new: Observations) -> Observat
     """Merge measurements of the same frames and layout in the order of time."""
     if held is None:
         return new
-    names = [field.name for field in fields(Observations) if field.name not in ("frames", "layout")]
+    names = [name for name in Observations.__slots__ if name not in ("frames", "layout")]
     order = time_order(held, new)
     return replace(
         held, **{name: np.concatenate([getattr(held, name), getattr(new, name)])[order] for name in names}

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 DURATION_S = 600.0
 SEEDS = (1, 2, 3)
+GAPS_DURATION_S = 300.0
 GAPS_S = ((math.inf, 0.0), (3.0, 2.0), (1.5, 3.0), (1.0, 5.0))
 """Mean durations of measurements and of gaps."""
 
@@ -104,7 +105,7 @@ def with_gaps(
     if not off_s:
         return measurements
     rng, start_ns = np.random.default_rng(seed), measurements[0].stamp_ns
-    count = int(2 * DURATION_S / (on_s + off_s))
+    count = int(2 * GAPS_DURATION_S / (on_s + off_s))
     changes_s = np.cumsum(np.stack([rng.exponential(on_s, count), rng.exponential(off_s, count)], axis=1))
     return [m for m in measurements if np.searchsorted(changes_s, (m.stamp_ns - start_ns) / 1e9) % 2 == 0]
 
@@ -113,10 +114,10 @@ def report_gaps() -> None:
     """Print what is found at the site of the rehearsal."""
     pipeline = SCENARIO.pipeline.model_copy(update={"estimator": "linear"})
     drives = []
-    for seed in SEEDS:
+    for seed in SEEDS[:2]:
         with simulated(
             SCENARIO.model_copy(update={"pipeline": pipeline}),
-            SimulationOptions(duration_s=DURATION_S, seed=seed),
+            SimulationOptions(duration_s=GAPS_DURATION_S, seed=seed),
         ) as run:
             path = run.master_logs[-1].recording()
             assert path is not None  # noqa: S101 (the master has recorded)

@@ -113,10 +113,13 @@ class Day:
         await self._collect("targets.csv", "Measure the targets")
 
     async def _collect(self, file: str, title: str) -> None:
-        await self._step(
-            title,
+        stop = (
             "The command that measures targets needs the radio, so the master has to stop:",
             "    ./systemctl stop tsgt-master",
+        )
+        await self._step(
+            title,
+            *(stop if self.watch.connected else ("The master is still stopped.",)),
             f"    tsgt calibrate collect --config master.toml --target-count {TARGETS} --target-constant-mm 0 --output {file}",
             "A helper at each tripod aims at the target that the command asks for; give him a second, then press Enter.",
             f"When all {TARGETS} targets of all stations are measured, press Enter once more, and start the master again:",

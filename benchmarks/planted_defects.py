@@ -38,7 +38,7 @@ from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterCon
 from tsgt.log import configure_logging
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.faults import FAST_SYNC_CYCLES, FaultKind
-from tsgt.simulation.mission import MASTER
+from tsgt.simulation.mission import MASTER, station_name
 from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import with_stations
@@ -115,6 +115,13 @@ async def killed_with_a_full_disk(mission: Mission) -> None:
     await mission.sleep_until(25.0)
     await mission.crash(MASTER, down_s=2.0)
     disk.write_error = None
+
+
+async def silent_station(mission: Mission) -> None:
+    """Leave station 2 without radio contact for half a minute."""
+    for at_s, attenuation_db in ((20.0, 300.0), (50.0, 0.0)):
+        await mission.sleep_until(at_s)
+        mission.air.link.set_attenuation(MASTER, station_name(2), attenuation_db)
 
 
 async def sleeping_reader(mission: Mission) -> None:
@@ -249,6 +256,12 @@ DEFECTS: Final = {
     "skipped-line": Defect("readers do not get every line", defects_published.skip_streamed_line),
     "velocity": Defect("velocities have the wrong sign", defects_published.reverse_velocities),
     "epoch": Defect("epochs are left out", defects_published.skip_epoch),
+    "heard": Defect(
+        "the time of the last packet is that of the first", defects_published.keep_first_packet_time
+    ),
+    "lost-event": Defect(
+        "a lost station is no event", defects_published.report_no_lost_station, script=silent_station
+    ),
     "queue": Defect(
         "a reader's queue has no bound", defects.unbound_reader_queue, script=sleeping_reader, duration_s=122
     ),

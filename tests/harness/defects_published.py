@@ -15,6 +15,7 @@ from tsgt.estimation import observations, pose_output, tracks
 from tsgt.estimation.pose_batch import PoseBatch
 from tsgt.master.classic import ingest
 from tsgt.master.recording_thread import RecordingThread
+from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
 from tsgt.simulation.mission import mission
@@ -177,3 +178,25 @@ def publish_age_zero(planting: Planting) -> None:
         return defective
 
     planting.replace_attribute(PoseBatch, "_shares", shares)
+
+
+def keep_first_packet_time(planting: Planting) -> None:
+    """State in the status that a station was last heard when it was first heard."""
+
+    def packet(original: Any) -> Any:
+        def defective(statistics: Any, station: int, now_ns: int, **signal: float) -> None:
+            first_ns = statistics._stations[station].received_ns
+            original(statistics, station, now_ns if first_ns is None else first_ns, **signal)
+
+        return defective
+
+    planting.replace_attribute(Statistics, "packet", packet)
+
+
+def report_no_lost_station(planting: Planting) -> None:
+    """Publish no event of a station that is lost."""
+    planting.replace_attribute(
+        StationEventDetector,
+        "tick",
+        lambda _: lambda _detector, _now_ns, *, realtime_ns: [],  # noqa: ARG005
+    )

@@ -30,6 +30,7 @@ from tsgt.simulation.checks.pose_lateness import lateness_failures
 from tsgt.simulation.checks.pose_rules import rule_failures
 from tsgt.simulation.checks.pose_twists import twist_failures
 from tsgt.simulation.checks.recorded_lines import recording_failures
+from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.faults import NTP_SLEW_PPM
 from tsgt.simulation.mission import JournalIndex
@@ -97,13 +98,14 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
     for master_log in result.master_logs:
         found += (Violation("recording", what) for what in recording_failures(master_log))
         found += (Violation("stream", what) for what in heard_failures(master_log))
-        found += (Violation("status", what) for what in status_failures(master_log))
+        found += (Violation("status", what) for what in status_failures(master_log, indices))
         found += (Violation("lost", what) for what in unpublished_replies(master_log))
         found += (Violation("pose", what) for what in age_failures(master_log, result.parameters))
         found += (Violation("pose", what) for what in lateness_failures(master_log, result, indices))
         found += (Violation("pose", what) for what in scale_failures(master_log, result))
         found += (Violation("pose", what) for what in twist_failures(master_log, result))
         found += (Violation("pose", what) for what in rule_failures(master_log, result.parameters))
+        found += (Violation("event", what) for what in event_failures(master_log))
         found += duplicate_deliveries(master_log)
         found += timestamp_violations(
             master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)

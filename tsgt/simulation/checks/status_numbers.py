@@ -3,65 +3,137 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from tsgt.estimation import usable
+from tsgt.model import Status
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from tsgt.model import PolarMeasurement
     from tsgt.recording import StationStatus
-    from tsgt.simulation.mission import MasterLog
+    from tsgt.simulation.mission import JournalIndex, MasterLog
 
-_AGE_TOLERANCE_S = 1e-6
+_TOLERANCE = 1e-6
 RATE_WINDOW_NS = 10_000_000_000
 MIN_RATE_SPAN_NS = 1_000_000_000
-_RATE_TOLERANCE_HZ = 1e-6
+LOCKED = (Status.OK, Status.LOW_ACCURACY, Status.ANGLE_ONLY)
+"""Statuses of an instrument that has a target."""
 
 
-def status_failures(master_log: MasterLog) -> Iterator[str]:
-    """Yield the first wrong number of a master's status records."""
+MAX_PERIOD_NS = 1_500_000_000
+"""Between two statuses, which come once per second."""
+
+MAX_WRONG_OFFSETS, MIN_OFFSETS = 0.1, 20
+"""Share of the clock offsets that may be beyond their bounds: a clock may be stepped between a measurement and the status."""
+
+FRESH_S = 1.0
+"""Maximum age of a measurement whose stamp tells the clock offset of the status."""
+
+
+def status_failures(master_log: MasterLog, indices: Mapping[int, JournalIndex]) -> Iterator[str]:
+    """Yield the first wrong number of a master's status records, and clock offsets that are often wrong."""
+    offsets = list(_offset_errors(master_log, indices))
+    wrong = sum(abs(error) > 1 for error in offsets)
+    if len(offsets) >= MIN_OFFSETS and wrong > MAX_WRONG_OFFSETS * len(offsets):
+        yield f"{wrong} of {len(offsets)} clock offsets of the stations are beyond their bounds"
+    stamps_ns = [status.stamp_ns for status in master_log.statuses]
+    for stamp_ns, next_ns in pairwise(stamps_ns):
+        if not 0 < next_ns - stamp_ns <= MAX_PERIOD_NS:
+            at_s = (stamp_ns - master_log.unix_at_zero_ns) / 1e9
+            yield f"the status after that of {at_s:.3f} s comes {(next_ns - stamp_ns) / 1e9:.3f} s later"
+            break
+    for at_s, station, published, usable_count, problem in _stations(master_log):
+        if problem or (
+            problem := _problem(station, published, usable_count, at_s, master_log.unix_at_zero_ns)
+        ):
+            yield f"status at {at_s:.3f} s: {problem}"
+            return
+
+
+def _stations(
+    master_log: MasterLog,
+) -> Iterator[tuple[float, StationStatus, list[PolarMeasurement], int, str]]:
+    """Yield for each status and station its time, what had been published of it, and what is wrong with the poses' counts."""
     by_station: dict[int, list[PolarMeasurement]] = defaultdict(list)
     usable_counts: dict[int, int] = defaultdict(int)
     seen = 0
     for status, (before, latest) in zip(master_log.statuses, master_log.counts_at_status, strict=True):
-        where = f"status at {(status.stamp_ns - master_log.unix_at_zero_ns) / 1e9:.3f} s"
+        problem = ""
         for name in ("poses", "valid_poses"):
             stated, least, most = getattr(status, name), getattr(before, name), getattr(latest, name)
             if not least <= stated <= most:
-                yield f"{where}: {stated} {name}, the stream has {least} to {most}"
-                return
+                problem = f"{stated} {name}, the stream has {least} to {most}"
         for measurement in master_log.measurements[seen : latest.measurements]:
             by_station[measurement.station].append(measurement)
             usable_counts[measurement.station] += usable(measurement)
         seen = latest.measurements
+        at_s = (status.stamp_ns - master_log.unix_at_zero_ns) / 1e9
         for station in status.stations:
-            published = by_station[station.id]
-            for what, stated, expected, tolerance in _expected(
-                station, published, usable_counts[station.id], status.stamp_ns
-            ):
-                if stated is None or all(abs(stated - each) > tolerance for each in expected):
-                    listed = " or ".join(f"{each:.9g}" for each in expected)
-                    yield f"{where}: station {station.id}: {what} {stated}, by the stream {listed}"
-                    return
+            yield at_s, station, by_station[station.id], usable_counts[station.id], problem
 
 
-def _expected(
-    station: StationStatus, published: list[PolarMeasurement], usable_count: int, now_ns: int
-) -> Iterator[tuple[str, float | None, tuple[float, ...], float]]:
-    """Yield name, stated value, possible values and tolerance of what the measurements of a station tell."""
-    yield "measurements", station.measurements, (len(published),), 0.0
-    yield "usable measurements", station.usable, (usable_count,), 0.0
-    if not published:
-        return
-    # The newest by time, or by arrival: an older one may arrive late, and a station's clock may have been stepped.
-    newest = (max(m.stamp_ns for m in published), published[-1].stamp_ns)
-    yield "age", station.age_s, tuple((now_ns - stamp_ns) / 1e9 for stamp_ns in newest), _AGE_TOLERANCE_S
-    span_ns = min(RATE_WINDOW_NS, max(now_ns - published[0].received_ns, MIN_RATE_SPAN_NS))
-    count = 0
-    for measurement in reversed(published):
-        if measurement.received_ns <= now_ns - RATE_WINDOW_NS:
-            break
-        count += 1
-    yield "rate", station.rate_hz, (count / (span_ns / 1e9),), _RATE_TOLERANCE_HZ
+def _problem(
+    station: StationStatus,
+    published: list[PolarMeasurement],
+    usable_count: int,
+    at_s: float,
+    unix_at_zero_ns: int,
+) -> str:
+    """Return what is wrong with the status of a station; empty: nothing."""
+    now_ns = round(at_s * 1e9) + unix_at_zero_ns
+    expected: list[tuple[str, float | str | None, tuple[float | str | None, ...]]] = [
+        ("measurements", station.measurements, (len(published),)),
+        ("usable measurements", station.usable, (usable_count,)),
+    ]
+    if published:
+        # The newest by time, or by arrival: an older one may arrive late, and a station's clock may have been stepped.
+        newest = (max(published, key=lambda m: m.stamp_ns), published[-1])
+        span_ns = min(RATE_WINDOW_NS, max(now_ns - published[0].received_ns, MIN_RATE_SPAN_NS))
+        count = 0
+        for measurement in reversed(published):
+            if measurement.received_ns <= now_ns - RATE_WINDOW_NS:
+                break
+            count += 1
+        expected += [
+            ("age", station.age_s, tuple((now_ns - m.stamp_ns) / 1e9 for m in newest)),
+            ("rate", station.rate_hz, (count / (span_ns / 1e9),)),
+            ("status", station.status, tuple(m.status for m in newest)),
+            ("bound of the stamp", station.stamp_bound_ns, tuple(m.stamp_bound_ns for m in newest)),
+        ]
+        locked = station.status is not None and station.status in LOCKED
+        since_s = (now_ns - published[-1].received_ns) / 1e9
+        if station.locked != locked:
+            return f"station {station.id}: locked {station.locked} with the status {station.status}"
+        if station.last_heard_s is None or not -_TOLERANCE <= station.last_heard_s <= since_s + _TOLERANCE:
+            return f"station {station.id}: last heard {station.last_heard_s} s ago, its last measurement came {since_s:.6f} s ago"
+    for what, stated, possible in expected:
+        if not any(_equal(stated, each) for each in possible):
+            listed = " or ".join(map(str, dict.fromkeys(possible)))
+            return f"station {station.id}: {what} {stated}, by the stream {listed}"
+    return ""
+
+
+def _equal(one: float | str | None, other: float | str | None) -> bool:
+    if isinstance(one, float) and isinstance(other, int | float):
+        return abs(one - other) <= _TOLERANCE
+    return one == other
+
+
+def _offset_errors(master_log: MasterLog, indices: Mapping[int, JournalIndex]) -> Iterator[float]:
+    """Yield errors of clock offsets in units of their bounds, where a fresh measurement was stamped with such an offset."""
+    for at_s, station, published, _, _ in _stations(master_log):
+        if station.clock_offset_ns is None or station.clock_bound_ns is None or not published:
+            continue
+        newest = published[-1]
+        journalled = indices[station.id].find(newest)
+        if (
+            journalled is not None
+            and at_s * 1e9 + master_log.unix_at_zero_ns - newest.stamp_ns < FRESH_S * 1e9
+        ):
+            true_ns = journalled.stamp_ns - newest.stamp_ns
+            yield (station.clock_offset_ns - true_ns) / max(
+                1, station.clock_bound_ns + (newest.stamp_bound_ns or 0)
+            )

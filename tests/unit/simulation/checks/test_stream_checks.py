@@ -8,22 +8,38 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.records import CLOCK, HEADER, PARAMETERS, POSE, SECOND, START, STATUS, imu_samples, measurement
+from harness.records import (
+    CLOCK,
+    EVENT,
+    HEADER,
+    PARAMETERS,
+    POSE,
+    SECOND,
+    START,
+    STATUS,
+    imu_samples,
+    measurement,
+)
 
+from tsgt.model import Status
 from tsgt.radio.classic import OK, MeasurementMessage
-from tsgt.recording import StationStatus, encode_line
+from tsgt.recording import StationStatus, StatusRecord, encode_line
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
 from tsgt.simulation.checks.pose_ages import age_failures
 from tsgt.simulation.checks.recorded_lines import recording_failures
+from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.mission import MasterLog
 from tsgt.simulation.mission.poll_replies import PollReply
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+_INDICES: Any = {1: SimpleNamespace(find=lambda m: m)}
+"""Journals of a station whose clock is that of the master."""
 
 
 def _log(folder: Path, *records: object) -> MasterLog:
@@ -78,17 +94,20 @@ def test_lines_that_a_reader_got(tmp_path: Path, heard: list[int], count: int) -
     assert len(list(heard_failures(log))) == count
 
 
-def _status(**changes: Any) -> Any:
-    station = {"id": 1, "measurements": 2, "usable": 2, "age_s": 0.6, "rate_hz": 2 / 1.0}
-    counts = {"poses": 1, "valid_poses": 1}
-    station = {name: changes.get(name, value) for name, value in station.items()}
-    return replace(
-        STATUS,
-        stamp_ns=START + SECOND,
-        poses=changes.get("poses", counts["poses"]),
-        valid_poses=changes.get("valid_poses", counts["valid_poses"]),
-        stations=(StationStatus(status=None, **station),),
+def _status(**changes: Any) -> StatusRecord:
+    """Return the status a second after the start, with two measurements, the last of which came half a second before."""
+    station = StationStatus(
+        id=1,
+        measurements=2,
+        usable=2,
+        age_s=0.6,
+        rate_hz=2.0,
+        status=Status.OK,
+        locked=True,
+        last_heard_s=0.5,
     )
+    counts = {name: changes.pop(name, 1) for name in ("poses", "valid_poses")}
+    return replace(STATUS, stamp_ns=START + SECOND, stations=(replace(station, **changes),), **counts)
 
 
 @pytest.mark.parametrize(
@@ -103,14 +122,90 @@ def _status(**changes: Any) -> Any:
         ({"age_s": 0.0}, 1),
         ({"age_s": None}, 1),
         ({"rate_hz": 2.5}, 1),
+        ({"status": Status.TILT}, 1),
+        ({"locked": False}, 1),
+        ({"stamp_bound_ns": 7}, 1),
+        ({"last_heard_s": 0.1}, 0),
+        ({"last_heard_s": 0.6}, 1),
+        ({"last_heard_s": None}, 1),
     ],
 )
 def test_status_with_a_wrong_number(tmp_path: Path, change: dict[str, Any], count: int) -> None:
-    """Numbers of poses and measurements, age and rate; a smoothed pose is of an epoch that was counted before."""
+    """Numbers of poses and measurements, age, rate and words; a smoothed pose is of an epoch that was counted before."""
     smoothed = replace(POSE, kind="smoothed")
     invalid = replace(POSE, valid=False, reason="outage")
     log = _log(tmp_path, measurement(0), POSE, smoothed, measurement(1), invalid, _status(**change))
-    assert len(list(status_failures(log))) == count
+    assert len(list(status_failures(log, _INDICES))) == count
+
+
+@pytest.mark.parametrize(("offset_ns", "count"), [(5_000, 0), (50_000, 1), (-50_000, 1)])
+def test_clock_offset_beyond_its_bound(tmp_path: Path, offset_ns: int, count: int) -> None:
+    """In each of 30 statuses; the station's clock is that of the master."""
+    statuses = [
+        replace(
+            _status(clock_offset_ns=offset_ns, clock_bound_ns=10_000, age_s=0.6 + number, last_heard_s=0.0),
+            stamp_ns=START + (number + 1) * SECOND,
+        )
+        for number in range(30)
+    ]
+    records: list[object] = []
+    for number, status in enumerate(statuses):
+        fresh = replace(
+            measurement(number), stamp_ns=status.stamp_ns - SECOND // 2, received_ns=status.stamp_ns
+        )
+        records += [fresh, status]
+    found = [each for each in status_failures(_log(tmp_path, *records), _INDICES) if "offsets" in each]
+    assert len(found) == count
+
+
+def test_status_that_comes_late(tmp_path: Path) -> None:
+    """Two seconds after the one before."""
+    first, second = (
+        replace(STATUS, stamp_ns=START + at * SECOND, stations=(), poses=0, valid_poses=0) for at in (1, 3)
+    )
+    assert "2.000 s later" in next(status_failures(_log(tmp_path, first, second), _INDICES))
+
+
+@pytest.mark.parametrize(
+    ("statuses", "events", "count"),
+    [
+        ((Status.OK, Status.LOW_ACCURACY), 0, 0),
+        ((Status.OK, Status.TILT), 1, 0),
+        ((Status.OK, Status.TILT), 0, 1),
+        ((Status.OK, Status.TILT, Status.TILT, Status.OK), 2, 0),
+        ((Status.OK, Status.OK), 1, 1),
+    ],
+)
+def test_events_of_an_instruments_status(
+    tmp_path: Path, statuses: tuple[Status, ...], events: int, count: int
+) -> None:
+    """One for each change."""
+    log = _log(
+        tmp_path,
+        *(replace(measurement(number), status=status) for number, status in enumerate(statuses)),
+        *(replace(EVENT, event="instrument_status", station=1) for _ in range(events)),
+    )
+    assert len(list(event_failures(log))) == count
+
+
+@pytest.mark.parametrize(
+    ("heard_s", "events", "count"),
+    [
+        (0.1, (), 0),
+        (21.0, (), 1),
+        (21.0, ("station_lost",), 0),
+        (0.1, ("station_lost",), 1),
+        (0.1, ("station_lost", "station_recovered"), 0),
+    ],
+)
+def test_events_of_lost_stations(tmp_path: Path, heard_s: float, events: tuple[str, ...], count: int) -> None:
+    """Lost and recovered, by when the station was heard."""
+    log = _log(
+        tmp_path,
+        *(replace(EVENT, event=event, station=1, stamp_ns=START) for event in events),
+        _status(last_heard_s=heard_s),
+    )
+    assert len(list(event_failures(log))) == count
 
 
 @pytest.mark.parametrize(("age_s", "count"), [(0.05, 0), (0.0, 1), (0.45, 1), (None, 1)])

@@ -53,11 +53,15 @@ def _series(master_log: MasterLog) -> list[str]:
 
 
 def _measured(master_log: MasterLog, result: MissionResult) -> NDArray[np.bool_]:
-    """Return for each epoch whether all prisms have a measurement before and after it, not too far from each other."""
+    """Return for each epoch whether all prisms have a measurement before and after it, not too far from each other.
+
+    One that took longer than the transport limit came too late.
+    """
     pipeline = result.parameters.pipeline
     times_ns = {prism.prism: [] for prism in result.parameters.prisms}
     for measurement in master_log.measurements:
-        if usable(measurement) and measurement.prism in times_ns:
+        delay_ns = measurement.received_ns - measurement.stamp_ns
+        if usable(measurement) and measurement.prism in times_ns and delay_ns <= pipeline.transport_limit_ns:
             times_ns[measurement.prism].append(measurement.stamp_ns)
     if not all(times_ns.values()):
         return np.zeros(0, dtype=np.bool_)

@@ -273,6 +273,18 @@ def test_poses_that_the_measurements_allow(tmp_path: Path, valid: int, count: in
     assert not list(missing_poses(result))
 
 
+def test_no_poses_are_expected_of_a_backlog(tmp_path: Path) -> None:
+    """Each measurement has arrived after three seconds."""
+    measured = [
+        replace(found, station=number, prism=number, received_ns=found.stamp_ns + 3 * SECOND)
+        for found in map(measurement, range(31))
+        for number in (1, 2, 3)
+    ]
+    log = _log(tmp_path, *measured, replace(POSE, valid=False, reason="outage"))
+    result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, master_logs=[log])
+    assert not list(missing_poses(result))
+
+
 @pytest.mark.parametrize(("oldest", "count"), [(0, 1), (1, 0), (None, 0)])
 def test_acknowledgement_that_was_not_journalled(tmp_path: Path, oldest: int | None, count: int) -> None:
     """The first measurement arrived at the start; a minute later it is still the oldest in the queue."""

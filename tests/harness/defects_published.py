@@ -35,7 +35,8 @@ def date_station_late(seconds: float) -> Callable[[Planting], None]:
     def plant(planting: Planting) -> None:
         def measured_at(original: Any) -> Any:
             def defective(measurement: Any, station: Any) -> int:
-                return int(original(measurement, station)) + round(seconds * 1e9) * (station.station == 2)
+                late_ns = round(seconds * 1e9) if station.station == 2 else 0
+                return int(original(measurement, station)) + late_ns
 
             return defective
 

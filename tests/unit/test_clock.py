@@ -22,12 +22,13 @@ def test_suspension_is_noticed() -> None:
 
 def test_each_suspension_begins_another_boot() -> None:
     """Two runs share a clock only if the computer was not suspended between them."""
-    first, same, later = (
-        SuspensionWatch(lambda ns=ns: ns).boot("boot") for ns in (40_000, 90_000, 300_000_000)
-    )
-    assert first == same == "boot"
-    assert later not in {first, SuspensionWatch(lambda: 600_000_000).boot("boot")}
-    assert SuspensionWatch(lambda: 600_000_000).boot("") == ""
+
+    def boot(suspended_ns: int, boot: str = "boot") -> str:
+        return SuspensionWatch(lambda: suspended_ns).boot(boot)
+
+    assert boot(40_000) == boot(90_000) == "boot"
+    assert boot(300_000_000) not in {"boot", boot(600_000_000)}
+    assert boot(600_000_000, "") == ""
 
 
 def test_suspensions_of_this_computer_are_counted() -> None:

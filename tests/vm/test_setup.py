@@ -51,14 +51,14 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _newer(package: Path, newer: Path, folder: Path) -> None:
     """Make a package of another one in which tsgt has another version."""
-    extract = ["dpkg-deb", "--raw-extract", package, folder]
+    extract = ["dpkg-deb", "--raw-extract", str(package), str(folder)]
     subprocess.run(extract, check=True)
     (wheel,) = folder.glob("usr/share/tsgt/wheels/tsgt-*.whl")
     wheel.unlink()
     installation.build_wheel(wheel.parent, version=NEWER)
     control = folder / "DEBIAN/control"
     control.write_text(re.sub("^Version: .*", f"Version: {NEWER}", control.read_text(), flags=re.MULTILINE))
-    command = ["dpkg-deb", "--root-owner-group", "-Znone", "--build", folder, newer]
+    command = ["dpkg-deb", "--root-owner-group", "-Znone", "--build", str(folder), str(newer)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 

@@ -330,7 +330,7 @@ def _motion_rows(
     """(K - 1, 9, 2 D + S + 1) whitened rows of the motion prior on position, velocity and acceleration, axis by axis."""
     assert factors.motion is not None  # noqa: S101 (only called without an accelerometer)
     phi, information = factors.motion
-    roots = (np.linalg.cholesky(information)).swapaxes(2, 3)
+    roots = np.swapaxes(np.linalg.cholesky(information), 2, 3)
     size = earlier.dim
     rows = np.zeros((len(phi), 9, 2 * size + shared + 1))
     for axis in range(3):

@@ -58,7 +58,7 @@ def _measured(master_log: MasterLog, result: MissionResult) -> NDArray[np.bool_]
     One that took longer than the transport limit came too late.
     """
     pipeline = result.parameters.pipeline
-    times_ns = {prism.prism: [] for prism in result.parameters.prisms}
+    times_ns: dict[int, list[int]] = {prism.prism: [] for prism in result.parameters.prisms}
     for measurement in master_log.measurements:
         delay_ns = measurement.received_ns - measurement.stamp_ns
         if usable(measurement) and measurement.prism in times_ns and delay_ns <= pipeline.transport_limit_ns:

@@ -114,4 +114,7 @@ def stamp_errors_s(
     if not found:
         return None
     times_ns, errors_ns = np.array(sorted(found), dtype=np.int64).T
-    return np.interp((at_ns - times_ns[0]) / 1e9, (times_ns - times_ns[0]) / 1e9, errors_ns / 1e9)
+    errors_s: NDArray[np.float64] = np.interp(
+        (at_ns - times_ns[0]) / 1e9, (times_ns - times_ns[0]) / 1e9, errors_ns / 1e9
+    )
+    return errors_s

@@ -82,7 +82,7 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
 
     def _due(self, timer: asyncio.TimerHandle) -> None:
         if not self.is_closed():
-            self._add_callback(timer)  # type: ignore[attr-defined]  # BaseEventLoop's, unknown to typeshed
+            self._add_callback(timer)
 
     def run_in_executor(
         self, executor: Executor | None, func: Callable[[Unpack[Ts]], T], *args: *Ts
@@ -134,14 +134,14 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
             self._suspended.remove(suspension)
             self._hold_callbacks()
             for handle in suspension.held:
-                self._add_callback(handle)  # type: ignore[attr-defined]  # as in _due
+                self._add_callback(handle)
 
         return resume
 
     def _hold_callbacks(self) -> None:
         """Look at each callback while some are held; at other times this costs nothing."""
         if self._suspended:
-            self.call_soon = self._call_soon_or_hold  # type: ignore[method-assign]
+            self.call_soon = self._call_soon_or_hold  # type: ignore[assignment, method-assign]
             self._add_callback = self._add_or_hold
         else:
             vars(self).pop("call_soon", None)

@@ -75,7 +75,7 @@ class ValidPoses:
     angular_velocity_radps: NDArray[np.float64]  # (N, 3) as published
     station_age_s: NDArray[np.float64]  # (N, M) age of each prism's last measurement, as published; NaN: none
 
-    def select(self, rows: NDArray[np.bool_]) -> ValidPoses:
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> ValidPoses:
         """Return the poses of these rows."""
         return ValidPoses(*(getattr(self, field.name)[rows] for field in fields(self)))
 

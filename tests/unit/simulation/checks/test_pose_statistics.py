@@ -42,7 +42,7 @@ def _drive(*, late_s: float = 0.0, stamp_error_s: float = 0.0, stated: float = 1
     errors = np.repeat(
         rng.normal(scale=SIGMA, size=(count // 5, 3)), 5, axis=0
     )  # correlated over a quarter second
-    columns = {field: np.zeros((count, 1)) for field in ValidPoses.__dataclass_fields__}
+    columns: dict[str, Any] = {field: np.zeros((count, 1)) for field in ValidPoses.__dataclass_fields__}
     columns |= {
         "stamp_ns": np.rint(at_s * 1e9).astype(np.int64) + START,
         "position_m": poses[:, :3, 3] + errors,
@@ -160,7 +160,7 @@ def test_standard_error_of_correlated_values() -> None:
     rng = np.random.default_rng(2)
     means = []
     for _ in range(200):
-        values = np.repeat(rng.normal(size=30), 40)
-        means.append(mean_of_correlated(np.arange(1200) * 0.05, values))
+        values = np.repeat(rng.standard_normal(30), 40)
+        means.append(mean_of_correlated(np.linspace(0.0, 59.95, 1200), values))
     found = np.array(means)
     assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.15)

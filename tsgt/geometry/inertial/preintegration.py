@@ -302,7 +302,8 @@ def _integrate(samples: ContiguousSamples, part: _Part) -> Preintegrated:
 
     weights = np.empty((count, longest, 8))
     weights[..., 0], weights[..., 1], weights[..., 2:] = 1.0, remaining_s, lever
-    sums = (weights.swapaxes(1, 2) @ integral.reshape(count, longest, 9)).reshape(count, 8, 3, 3)
+    weights_T = weights.swapaxes(1, 2)
+    sums = (weights_T @ integral.reshape(count, longest, 9)).reshape(count, 8, 3, 3)
     by_gyro_bias, by_accelerometer_bias = np.empty((count, 9, 3)), np.zeros((count, 9, 3))
     by_accelerometer_bias[:, 0:3], by_accelerometer_bias[:, 6:9] = -sums[:, 1], -sums[:, 0]
     by_gyro_bias[:, 0:3], by_gyro_bias[:, 6:9] = _sum_of_crosses(sums[:, 5:8]), _sum_of_crosses(sums[:, 2:5])
@@ -310,12 +311,15 @@ def _integrate(samples: ContiguousSamples, part: _Part) -> Preintegrated:
 
     gyro_variance = samples.gyro_density[index] ** 2 * dt_s
     force_variance = samples.accelerometer_density[index] ** 2 * dt_s
+    by_gyro = (weights_T * gyro_variance[:, None]) @ weights
+    by_force = (weights_T[:, :2] * force_variance[:, None]) @ weights[..., :2]
+    within = (force_variance * dt_s**2).sum(axis=1) / 12
     return Preintegrated(
         part.end_s - part.start_s,
         total[:, 3:] - sculling.sum(axis=1),
         end_rotation,
         total[:, :3].copy(),
-        _covariance(lever, end_rotation_T, gyro_variance, force_variance, dt_s, remaining_s),
+        _covariance(by_gyro, by_force, within, end_rotation_T),
         by_gyro_bias,
         by_accelerometer_bias,
         part.biases[:, :3],
@@ -357,55 +361,75 @@ def _by_matrices(samples: ContiguousSamples, part: _Part) -> tuple[FloatArray, F
 
 def _sum_of_crosses(products: FloatArray) -> FloatArray:
     """Sum of ``skew(a) @ M``, (K, 3, 3), from the sum of the products ``a_i M_jk``, (K, 3, 3, 3)."""
-    crosses: FloatArray = np.stack(
-        [
-            products[:, 1, 2] - products[:, 2, 1],
-            products[:, 2, 0] - products[:, 0, 2],
-            products[:, 0, 1] - products[:, 1, 0],
-        ],
-        axis=1,
-    )
-    return crosses
+    # Every product is with 0 or ±1: exact.
+    crosses: FloatArray = products.reshape(-1, 27) @ _CROSSES
+    return crosses.reshape(-1, 3, 3)
+
+
+def _crosses() -> FloatArray:
+    """(27, 9) of the products ``a_i M_jk`` to ``skew(a) @ M``, both flattened."""
+    matrix = np.zeros((3, 3, 3, 3, 3))
+    for i in range(3):
+        row, column = (i + 1) % 3, (i + 2) % 3
+        for k in range(3):
+            matrix[row, column, k, i, k], matrix[column, row, k, i, k] = 1.0, -1.0
+    return matrix.reshape(27, 9)
+
+
+_CROSSES = _crosses()
 
 
 def _covariance(
-    lever: FloatArray,
-    end_rotation_T: FloatArray,
-    gyro_variance: FloatArray,
-    force_variance: FloatArray,
-    dt_s: FloatArray,
-    remaining_s: FloatArray,
+    by_gyro: FloatArray, by_force: FloatArray, within: FloatArray, end_rotation_T: FloatArray
 ) -> FloatArray:
-    """(K, 9, 9) of white noise, whose variance of angle and velocity per sample is given, (K, S).
+    """(K, 9, 9) of white noise, from its sums over the samples of each interval.
+
+    Each sample i has a variance of angle and one of velocity. ``by_gyro``, (K, 8, 8): sum of the first times ``u u^T`` with u of 1, the remaining time,
+    and how later samples change velocity and position, 3 each; ``by_force``, (K, 2, 2): the same of the second with the first two; ``within``, (K,): of the second times dt^2 / 12.
 
     The error of rotation n_i, isotropic, moves the velocity by ``-skew(lever_i) n_i``, and the products of skew-symmetric
     matrices are ``skew(a) skew(b)^T = (a . b) I - b a^T``.
     """
-    covariance = np.zeros((len(lever), 9, 9))
-    weighted = lever * gyro_variance[..., None]
-    moments = weighted.swapaxes(1, 2) @ lever
-    sums = weighted.sum(axis=1)
-    position, rotation, velocity = slice(0, 3), slice(3, 6), slice(6, 9)
-    of_position, of_velocity = slice(3, 6), slice(0, 3)
-    for rows, columns, a, b in (
-        (position, position, of_position, of_position),
-        (position, velocity, of_position, of_velocity),
-        (velocity, velocity, of_velocity, of_velocity),
-    ):
-        product = moments[:, a, b]
-        trace = product[:, 0, 0] + product[:, 1, 1] + product[:, 2, 2]
-        covariance[:, rows, columns] = trace[:, None, None] * IDENTITY - product.swapaxes(1, 2)
-    covariance[:, rotation, rotation] = gyro_variance.sum(axis=1)[:, None, None] * IDENTITY
+    count = len(by_gyro)
     # The transpose of ``-skew(lever)`` is ``skew(lever)``.
-    covariance[:, rotation, position] = end_rotation_T @ skew(sums[:, of_position])
-    covariance[:, rotation, velocity] = end_rotation_T @ skew(sums[:, of_velocity])
-    for rows, columns, variance in (
-        (position, position, (force_variance * (remaining_s**2 + dt_s**2 / 12)).sum(axis=1)),
-        (position, velocity, (force_variance * remaining_s).sum(axis=1)),
-        (velocity, velocity, force_variance.sum(axis=1)),
-    ):
-        covariance[:, rows, columns] += variance[:, None, None] * IDENTITY
-    covariance[:, position, rotation] = covariance[:, rotation, position].swapaxes(1, 2)
-    covariance[:, velocity, rotation] = covariance[:, rotation, velocity].swapaxes(1, 2)
-    covariance[:, velocity, position] = covariance[:, position, velocity].swapaxes(1, 2)
-    return covariance
+    turned = end_rotation_T[:, None] @ skew(by_gyro[:, 0, 2:].reshape(count, 2, 3))
+    terms = np.concatenate(
+        [
+            by_gyro.reshape(count, 64),
+            by_force.reshape(count, 4),
+            within[:, None],
+            turned.reshape(count, 18),
+        ],
+        axis=1,
+    )
+    covariance: FloatArray = terms @ _COVARIANCE
+    return covariance.reshape(count, 9, 9)
+
+
+def _covariance_terms() -> FloatArray:
+    """(87, 81) of the sums in :func:`_covariance` to the covariance, both flattened: zeros and ones."""
+    by_gyro, by_force = np.arange(64).reshape(8, 8), 64 + np.arange(4).reshape(2, 2)
+    within, turned = 68, 69 + np.arange(18).reshape(2, 3, 3)
+    velocity, position = 0, 1  # Of what comes in the order of ``turned``
+    matrix = np.zeros((87, 9, 9))
+    begin = {position: 0, velocity: 6}
+    for a in (position, velocity):
+        for b in (position, velocity):
+            product = by_gyro[2 + 3 * a : 5 + 3 * a, 2 + 3 * b : 5 + 3 * b]
+            for i in range(3):
+                row, column = begin[a] + i, begin[b] + i
+                matrix[by_force[a, b], row, column] += 1.0
+                for j in range(3):
+                    matrix[product[j, j], row, column] += 1.0
+                    matrix[product[j, i], row, begin[b] + j] -= 1.0
+        for i in range(3):
+            for j in range(3):
+                matrix[turned[a, i, j], 3 + i, begin[a] + j] = 1.0
+                matrix[turned[a, i, j], begin[a] + j, 3 + i] = 1.0
+    for i in range(3):
+        matrix[by_gyro[0, 0], 3 + i, 3 + i] = 1.0
+        matrix[within, i, i] = 1.0
+    return matrix.reshape(87, 81)
+
+
+_COVARIANCE = _covariance_terms()

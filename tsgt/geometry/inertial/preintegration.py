@@ -180,24 +180,33 @@ def preintegrate(
     subtracted.
     """
     biases = _biases(len(start_s), gyro_bias, accelerometer_bias)
-    parts = [_integrate(samples, part) for part in _parts(samples, start_s, end_s, biases)]
+    parts = [
+        _integrate(samples, part, _integrals(samples, part))
+        for part in _parts(samples, start_s, end_s, biases)
+    ]
     return parts[0] if len(parts) == 1 else concatenate_preintegrated(parts)
 
 
-def matrix_jacobians(
+def preintegrate_with_matrices(
     samples: ContiguousSamples,
     start_s: FloatArray,
     end_s: FloatArray,
     gyro_bias: FloatArray,
     accelerometer_bias: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of the preintegrated errors by errors of scale and misalignment, (K, 9, 3, 3) each; arguments as above.
+) -> tuple[Preintegrated, FloatArray, FloatArray]:
+    """Preintegrate, and Jacobians of the errors by errors of scale and misalignment, (K, 9, 3, 3) each; arguments as above.
 
     The first is that by E, (3, 3), if all angular rates are multiplied by ``I + E``, the second the same for specific forces.
     """
     biases = _biases(len(start_s), gyro_bias, accelerometer_bias)
-    parts = [_by_matrices(samples, part) for part in _parts(samples, start_s, end_s, biases)]
-    return np.concatenate([each[0] for each in parts]), np.concatenate([each[1] for each in parts])
+    motions, by_gyro, by_accelerometer = [], [], []
+    for part in _parts(samples, start_s, end_s, biases):
+        found = _integrals(samples, part)
+        motions.append(_integrate(samples, part, found))
+        of_gyro, of_accelerometer = _by_matrices(samples, found)
+        by_gyro.append(of_gyro)
+        by_accelerometer.append(of_accelerometer)
+    return concatenate_preintegrated(motions), np.concatenate(by_gyro), np.concatenate(by_accelerometer)
 
 
 def _biases(count: int, gyro_bias: FloatArray, accelerometer_bias: FloatArray) -> FloatArray:
@@ -287,18 +296,19 @@ def _integrals(samples: ContiguousSamples, part: _Part) -> _Integrals:
     moments = increment * remaining_s[..., None]
     # An error of rotation in sample i, in the axes at the start, acts on all later increments, and half on its own.
     lever = np.concatenate([increment, moments], axis=2)
-    total = lever.sum(axis=1)
-    lever = total[:, None] - np.cumsum(lever, axis=1) + 0.5 * lever
+    so_far = np.cumsum(lever, axis=1)
+    total = so_far[:, -1].copy()
+    lever = 0.5 * lever + (total[:, None] - so_far)
     return _Integrals(index, dt_s, remaining_s, angle, force, integral, rotation[:, -1].copy(), lever, total)
 
 
-def _integrate(samples: ContiguousSamples, part: _Part) -> Preintegrated:
+def _integrate(samples: ContiguousSamples, part: _Part, found: _Integrals) -> Preintegrated:
     """Preintegrate intervals."""
-    index, dt_s, remaining_s, angle, force, integral, end_rotation, lever, total = _integrals(samples, part)
+    index, dt_s, remaining_s, angle, force, integral, end_rotation, lever, total = found
     count, longest = dt_s.shape
     end_rotation_T = end_rotation.swapaxes(1, 2)
     # The increment's mean time is a little off the middle of the sample, for it turns meanwhile.
-    sculling = matvec(integral, cross(angle, force)) * (dt_s / 12)[..., None]
+    sculling = (dt_s / 12)[:, None] @ matvec(integral, cross(angle, force))
 
     weights = np.empty((count, longest, 8))
     weights[..., 0], weights[..., 1], weights[..., 2:] = 1.0, remaining_s, lever
@@ -316,7 +326,7 @@ def _integrate(samples: ContiguousSamples, part: _Part) -> Preintegrated:
     within = (force_variance * dt_s**2).sum(axis=1) / 12
     return Preintegrated(
         part.end_s - part.start_s,
-        total[:, 3:] - sculling.sum(axis=1),
+        total[:, 3:] - sculling[:, 0],
         end_rotation,
         total[:, :3].copy(),
         _covariance(by_gyro, by_force, within, end_rotation_T),
@@ -328,20 +338,14 @@ def _integrate(samples: ContiguousSamples, part: _Part) -> Preintegrated:
     )
 
 
-def _by_matrices(samples: ContiguousSamples, part: _Part) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of :func:`matrix_jacobians`: a bias of each sample that is proportional to what it measures."""
-    found = _integrals(samples, part)
+def _by_matrices(samples: ContiguousSamples, found: _Integrals) -> tuple[FloatArray, FloatArray]:
+    """Jacobians by the matrices: a bias of each sample that is proportional to what it measures."""
     count, longest = found.dt_s.shape
     rate, force = samples.angular_rate_radps[found.rows], samples.specific_force_mps2[found.rows]
-    of_gyro = np.concatenate([np.ones((count, longest, 1)), found.lever], axis=2)
-    of_accelerometer = np.stack([np.ones((count, longest)), found.remaining_s], axis=2)
-    weights = np.concatenate(
-        [
-            (of_gyro[..., None] * rate[:, :, None]).reshape(count, longest, 21),
-            (of_accelerometer[..., None] * force[:, :, None]).reshape(count, longest, 6),
-        ],
-        axis=2,
-    )
+    weights = np.empty((count, longest, 27))
+    weights[..., 0:3], weights[..., 21:24] = rate, force
+    weights[..., 3:21] = (found.lever[..., None] * rate[:, :, None]).reshape(count, longest, 18)
+    np.multiply(force, found.remaining_s[..., None], out=weights[..., 24:27])
     sums = weights.swapaxes(1, 2) @ found.integral.reshape(count, longest, 9)
     # (K, weight, component of the measured vector, 3, 3)
     by_rate, by_force = (

@@ -19,7 +19,7 @@ from tsgt.geometry.inertial.factors import (
     assemble_inertial,
     linearise_inertial,
 )
-from tsgt.geometry.inertial.preintegration import matrix_jacobians
+from tsgt.geometry.inertial.preintegration import preintegrate_with_matrices
 from tsgt.geometry.inertial.states import TILT_DIM
 from tsgt.geometry.inertial_calibration.setup import (
     ACCELEROMETER_MATRIX,
@@ -86,6 +86,9 @@ class JointEquations(NamedTuple):
     states: InertialEquations
     observations: Observations  # As they are seen from the IMU
     factors: InertialFactors
+    by_matrices: tuple[
+        FloatArray, FloatArray
+    ]  # (K - 1, 9, 3, 3) each: the motion's error by those of gyro and accelerometer
     samples: ContiguousSamples  # With the matrices applied
     deviation: FloatArray  # (2 + D,) of tilt and set-up from their prior, in sigmas
     cost: float
@@ -128,7 +131,11 @@ def assemble_states(problem: JointProblem, point: JointPoint) -> JointEquations:
         angular_rate_radps=problem.samples.angular_rate_radps @ setup.gyro_matrix.T,
         specific_force_mps2=problem.samples.specific_force_mps2 @ setup.accelerometer_matrix.T,
     )
-    factors = InertialFactors.of(samples, point.knots, problem.noise)
+    earlier, later_s = point.knots.select(slice(None, -1)), point.knots.time_s[1:]
+    motion, *by_matrices = preintegrate_with_matrices(
+        samples, earlier.time_s, later_s, earlier.gyro_bias, earlier.bias_or_acceleration
+    )
+    factors = InertialFactors.between(samples, earlier, later_s, problem.noise, found=motion)
     states = assemble_inertial(
         observations,
         problem.knot_index,
@@ -141,8 +148,9 @@ def assemble_states(problem: JointProblem, point: JointPoint) -> JointEquations:
     )
     errors = np.concatenate([point.gravity.tilt, setup.local_coordinates_about(problem.prior.mean)])
     deviation = errors / problem.prior_sigmas
+    cost = states.cost + float(deviation @ deviation)
     return JointEquations(
-        states, observations, factors, samples, deviation, states.cost + float(deviation @ deviation)
+        states, observations, factors, (by_matrices[0], by_matrices[1]), samples, deviation, cost
     )
 
 
@@ -167,7 +175,7 @@ def assemble_border(problem: JointProblem, point: JointPoint, found: JointEquati
     gradient[of_setup] += matvec(weighted, states.linearised.residuals_m).sum(axis=0)
 
     rows = linearise_inertial(knots, point.gravity, found.factors)
-    by_matrices = motion_by_matrices(knots, setup, found.factors, found.samples)
+    by_matrices = motion_by_matrices(knots, setup, found.factors, found.by_matrices)
     own = slice(TILT_DIM + GYRO_MATRIX.start, TILT_DIM + ACCELEROMETER_MATRIX.stop)
     products = np.swapaxes(rows, 1, 2) @ by_matrices
     mixed[:-1, :, own] += products[:, 0:15]
@@ -196,24 +204,27 @@ def measurements_by_setup(
 
 
 def motion_by_matrices(
-    knots: InertialStates, setup: ImuSetup, factors: InertialFactors, samples: ContiguousSamples
+    knots: InertialStates,
+    setup: ImuSetup,
+    factors: InertialFactors,
+    by_matrices: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
     """(K - 1, 9, 15) whitened rows of the preintegrated motion by the errors of the gyro's and accelerometer's matrices."""
     found = factors.preintegrated
-    by_rate, by_force = matrix_jacobians(
-        samples, knots.time_s[:-1], knots.time_s[1:], found.gyro_bias, found.accelerometer_bias
-    )
     # From errors by which values are multiplied to those that are added to the matrices.
-    by_gyro = np.einsum(
-        "kril,jl,sij->krs", by_rate, np.linalg.inv(setup.gyro_matrix), gyro_directions(setup.vertical)
+    parts = zip(
+        by_matrices,
+        (setup.gyro_matrix, setup.accelerometer_matrix),
+        (gyro_directions(setup.vertical), accelerometer_directions(setup.vertical)),
+        strict=True,
     )
-    by_accelerometer = np.einsum(
-        "kril,jl,sij->krs",
-        by_force,
-        np.linalg.inv(setup.accelerometer_matrix),
-        accelerometer_directions(setup.vertical),
+    by_error = np.concatenate(
+        [
+            by_matrix.reshape(len(found), 9, 9) @ (directions @ np.linalg.inv(matrix)).reshape(-1, 9).T
+            for by_matrix, matrix, directions in parts
+        ],
+        axis=2,
     )
-    by_error = np.concatenate([by_gyro, by_accelerometer], axis=2)
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
     _, rotation, _ = found.corrected(earlier.gyro_bias, earlier.bias_or_acceleration)
     turned = np.swapaxes(earlier.rotation, 1, 2) @ later.rotation

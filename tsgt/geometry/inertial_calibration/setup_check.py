@@ -99,6 +99,12 @@ class SetupFinding:
     text: str
 
 
+ALIGNED_S = 0.02
+"""Latency by alignment, which is wrong by ten milliseconds, below which the joint estimation starts from the configured one: knots
+that are right at once need not be chosen again.
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class SetupCheck:
     """What a drive says about the configuration of an IMU; nothing, if it does not tell."""
@@ -151,7 +157,8 @@ def check_imu_setup(
     gross = _wrong_axes(products, alignment.rotation, mounting.rotation)
     if gross is not None:
         return SetupCheck((gross,))
-    start = _Start(alignment.rotation, alignment.latency_s, alignment.gyro_bias)
+    right = abs(alignment.latency_s) < ALIGNED_S
+    start = _Start(alignment.rotation, 0.0 if right else alignment.latency_s, alignment.gyro_bias)
     found = _estimated_errors(observations, trajectory.knots, samples, mounting, noise, gravity, start)
     return replace(found, excluded=found.excluded | GROSS)
 

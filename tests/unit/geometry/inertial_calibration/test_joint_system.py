@@ -89,7 +89,7 @@ def test_motion_by_matrices(example: Example) -> None:
     """Both matrices move the residuals of the preintegrated motion; the covariance, which they move too, is constant."""
     problem, point = example
     found = assemble_states(problem, point)
-    jacobian = motion_by_matrices(point.knots, point.setup, found.factors, found.samples)
+    jacobian = motion_by_matrices(point.knots, point.setup, found.factors, found.by_matrices)
     matrices = slice(GYRO_MATRIX.start, ACCELEROMETER_MATRIX.stop)
     for row, component in enumerate(range(point.setup.dim)[matrices]):
         expected = np.empty((len(point.knots) - 1, 9))

@@ -29,7 +29,7 @@ from tsgt.simulation.checks.pose_consistency import pose_failures
 from tsgt.simulation.checks.pose_lateness import lateness_failures
 from tsgt.simulation.checks.pose_rules import rule_failures
 from tsgt.simulation.checks.pose_twists import twist_failures
-from tsgt.simulation.checks.recorded_lines import recording_failures
+from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
 from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.faults import NTP_SLEW_PPM
@@ -97,6 +97,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
     found += (Violation("liveness", what) for what in missing_poses(result))
     for master_log in result.master_logs:
         found += (Violation("recording", what) for what in recording_failures(master_log))
+        found += (Violation("status", what) for what in size_failures(master_log))
         found += (Violation("stream", what) for what in heard_failures(master_log))
         found += (Violation("status", what) for what in status_failures(master_log, indices))
         found += (Violation("lost", what) for what in unpublished_replies(master_log))

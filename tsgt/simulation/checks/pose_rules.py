@@ -21,7 +21,14 @@ MAX_SMOOTHING_S = 0.5
 
 _SENT_TOLERANCE_S = 1e-3
 _UNIT_TOLERANCE = 1e-6
-_LIMIT_TOLERANCE = 1.0 + 1e-6
+_RESIDUAL_TOLERANCE_M = 1e-9
+_LIMIT_TOLERANCE = 1.01  # sigmas are compared before they are rounded, and before terms of second order
+
+GOOD_SHARE = 0.5
+"""Share of the limits of residual and sigmas up to which a pose is good; beyond it is degraded."""
+
+GOOD_AGE_SHARE = 0.75
+"""Share of the outage limit up to which a prediction's newest measurement is not old."""
 
 
 def rule_failures(master_log: MasterLog, parameters: Parameters) -> Iterator[str]:
@@ -60,21 +67,35 @@ def _broken(
     earliest_s, latest_s = sent_window_s(series, parameters)
     out = (sent_s < earliest_s - _SENT_TOLERANCE_S) | (sent_s > latest_s + _SENT_TOLERANCE_S)
     yield f"it was not sent {earliest_s:g} to {latest_s:g} s after its epoch", out
-    yield "valid in spite of its residual", poses.residual_m > limits.residual_limit_m * _LIMIT_TOLERANCE
     upright = rotation_from_quaternion(quaternion)[:, 2, 2]
     yield "valid in spite of its tilt", upright < np.cos(limits.tilt_limit_rad * _LIMIT_TOLERANCE)
-    if series == "interpolated":
-        return
+    different = abs(poses.residual_m - poses.station_residual_m) > _RESIDUAL_TOLERANCE_M
+    yield "its residual is not that of its stations", different
+    shares = [("residual", poses.residual_m / limits.residual_limit_m)]
+    if series != "interpolated":
+        shares += _sigma_shares(poses, series, parameters)
+    for name, share in shares:
+        yield f"valid in spite of its {name}", share > _LIMIT_TOLERANCE
+        yield f"good in spite of its {name}", poses.good & (share > GOOD_SHARE * _LIMIT_TOLERANCE)
+    if series == "predicted":
+        old = poses.newest_age_s > GOOD_AGE_SHARE * limits.outage_limit_ns / 1e9 * _LIMIT_TOLERANCE
+        yield "good in spite of old measurements", poses.good & old
+
+
+def _sigma_shares(
+    poses: ValidPoses, series: str, parameters: Parameters
+) -> list[tuple[str, NDArray[np.float64]]]:
+    """Return the sigmas of position and rotation along the least certain direction, as shares of their limits."""
+    limits = parameters.pipeline
     position_limit_m, rotation_limit_rad = limits.position_sigma_limit_m, limits.rotation_sigma_limit_rad
     if series == "predicted":
         position_limit_m = limits.predicted_position_sigma_limit_m
         rotation_limit_rad = limits.predicted_rotation_sigma_limit_rad
-    for name, part, limit in (
-        ("position", slice(0, 3), position_limit_m),
-        ("rotation", slice(3, 6), rotation_limit_rad),
-    ):
-        sigma = np.sqrt(np.linalg.eigvalsh(poses.covariance[:, part, part])[:, -1])
-        yield f"valid in spite of the sigma of its {name}", sigma > limit * _LIMIT_TOLERANCE
+    parts = (("position", slice(0, 3), position_limit_m), ("rotation", slice(3, 6), rotation_limit_rad))
+    return [
+        (f"sigma of the {name}", np.sqrt(np.linalg.eigvalsh(poses.covariance[:, part, part])[:, -1]) / limit)
+        for name, part, limit in parts
+    ]
 
 
 def sent_window_s(series: str, parameters: Parameters) -> tuple[float, float]:

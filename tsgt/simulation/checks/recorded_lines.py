@@ -15,6 +15,8 @@ _NOT_STREAMED = tuple(
 )
 """Starts of lines that are recorded only."""
 
+_STATUS_START = b'{"type":"status",'
+
 
 def recording_failures(master_log: MasterLog) -> Iterator[str]:
     """Yield the first difference between recording and stream.
@@ -33,6 +35,30 @@ def recording_failures(master_log: MasterLog) -> Iterator[str]:
         count += 1
     if count < len(hashes) and not master_log.crashed:
         yield f"{path.name}: {count} lines of the stream's {len(hashes)} are recorded"
+
+
+def size_failures(master_log: MasterLog) -> Iterator[str]:
+    """Yield the first status that states another file than the recording, or a size that it did not have."""
+    path = master_log.recording()
+    if path is None:
+        return
+    size = before = 0
+    at = 0
+    with path.open("rb") as file:
+        for line in file:
+            if line.startswith(_STATUS_START) and at < len(master_log.statuses):
+                stated = master_log.statuses[at].recording
+                at += 1
+                # Between the status before and this one, unless lines have to wait for the disk.
+                if stated is not None and not (
+                    stated.file == path.name
+                    and (stated.waiting_lines or before <= stated.bytes)
+                    and stated.bytes <= size
+                ):
+                    yield f"status {at}: {stated.bytes} bytes in {stated.file}, {path.name} had {before} to {size}"
+                    return
+                before = size + len(line)
+            size += len(line)
 
 
 def _streamed_lines(path: Path) -> Iterator[bytes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
 from dataclasses import dataclass, field, fields
@@ -73,6 +74,8 @@ class ValidPoses:
     covariance: NDArray[np.float64]  # (N, 6, 6) as published
     velocity_mps: NDArray[np.float64]  # (N, 3) as published
     angular_velocity_radps: NDArray[np.float64]  # (N, 3) as published
+    station_residual_m: NDArray[np.float64]  # (N,) root mean square of the stations' residuals, as published
+    good: NDArray[np.bool_]  # (N,) whether the published quality is ``good``
     station_age_s: NDArray[np.float64]  # (N, M) age of each prism's last measurement, as published; NaN: none
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> ValidPoses:
@@ -142,6 +145,7 @@ class MasterLog:
         self._pose_station_ages_s = array("d")
         self._counts = self._counts_before_poses = PublishedCounts(0, 0, 0)
         self._pose_with_imu = array("b")
+        self._pose_good = array("b")
 
     def observe(self, record: object, line: bytes) -> None:
         """Log a published record and its line."""
@@ -197,12 +201,15 @@ class MasterLog:
         self._pose_numbers.extend(pose.covariance or ())
         self._pose_numbers.extend(pose.velocity_mps or _UNKNOWN)
         self._pose_numbers.extend(pose.angular_velocity_radps or _UNKNOWN)
+        squares = [share.residual_m**2 for share in pose.stations if share.residual_m is not None]
+        self._pose_numbers.append(math.sqrt(sum(squares) / len(squares)) if squares else np.nan)
+        self._pose_good.append(pose.quality == "good")
         self._pose_with_imu.append(pose.imu == "used")
         self._pose_series.append(self._series.setdefault(pose.series, len(self._series)))
 
     def valid_poses(self) -> ValidPoses:
         """Return the valid poses published so far."""
-        numbers = np.array(self._pose_numbers).reshape(-1, 51)
+        numbers = np.array(self._pose_numbers).reshape(-1, 52)
         return ValidPoses(
             stamp_ns=np.array(self._pose_stamps, dtype=np.int64),
             position_m=numbers[:, :3],
@@ -215,7 +222,9 @@ class MasterLog:
             with_imu=np.array(self._pose_with_imu, dtype=np.bool_),
             covariance=numbers[:, 9:45].reshape(-1, 6, 6),
             velocity_mps=numbers[:, 45:48],
-            angular_velocity_radps=numbers[:, 48:],
+            angular_velocity_radps=numbers[:, 48:51],
+            station_residual_m=numbers[:, 51],
+            good=np.array(self._pose_good, dtype=np.bool_),
             station_age_s=np.array(self._pose_station_ages_s).reshape(
                 len(numbers), -1 if len(numbers) else 0
             ),

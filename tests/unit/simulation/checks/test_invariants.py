@@ -269,7 +269,7 @@ def test_pose_from_an_unusable_measurement_is_detected(result: MissionResult) ->
 def test_wrong_pose_is_detected(result: MissionResult) -> None:
     """A pose of ``linear`` is checked to a millimetre, one of ``continuous`` to its covariance."""
     linear = result.parameters.pipeline.estimator == "linear"
-    result.master_logs[0]._pose_numbers[51 * 100] += 1e-3 if linear else 1.0
+    result.master_logs[0]._pose_numbers[52 * 100] += 1e-3 if linear else 1.0
     assert _checks(result) == {"pose"}
 
 
@@ -281,7 +281,7 @@ def test_overconfident_or_biased_poses_are_detected(
     monkeypatch.setattr(pose_consistency, "_MIN_POSES", 300)
     session = result.master_logs[0]
     assert list(pose_consistency.distribution_failures(session, result)) == []
-    numbers = np.array(session._pose_numbers).reshape(-1, 51)
+    numbers = np.array(session._pose_numbers).reshape(-1, 52)
     if part.start:
         numbers[:, part] /= 16
     else:

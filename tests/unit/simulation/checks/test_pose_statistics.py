@@ -128,14 +128,23 @@ def test_wrong_velocity_is_detected() -> None:
         ("sent_age_s", 2.9, "not sent 3 to 3.5 s"),
         ("sent_age_s", 3.6, "not sent 3 to 3.5 s"),
         ("residual_m", 0.051, "residual"),
-        ("covariance", np.eye(6) * 0.06**2, "sigma of its position"),
+        ("covariance", np.eye(6) * 0.06**2, "valid in spite of its sigma of the position"),
+        ("covariance", np.diag([0.026**2] * 3 + [1e-6] * 3), "good in spite of its sigma of the position"),
+        ("station_residual_m", 0.003, "not that of its stations"),
     ],
 )
 def test_pose_against_the_rules_is_detected(field: str, row: Any, what: str) -> None:
     """A single one of all."""
     log, result, _ = _drive()
     poses = log.valid_poses()
-    poses = replace(poses, sent_age_s=np.full(len(poses.stamp_ns), 3.2), residual_m=poses.residual_m[:, 0])
+    count = len(poses.stamp_ns)
+    poses = replace(
+        poses,
+        sent_age_s=np.full(count, 3.2),
+        residual_m=np.full(count, 0.001),
+        station_residual_m=np.full(count, 0.001),
+        good=np.ones(count, dtype=bool),
+    )
     log.valid_poses, log.epochs_ns = lambda: poses, {}
     assert not list(rule_failures(log, result.parameters))
     values = getattr(poses, field).copy()

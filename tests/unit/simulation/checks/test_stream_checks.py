@@ -23,13 +23,13 @@ from harness.records import (
 
 from tsgt.model import Status
 from tsgt.radio.classic import OK, MeasurementMessage
-from tsgt.recording import StationStatus, StatusRecord, encode_line
+from tsgt.recording import RecordingStatus, StationStatus, StatusRecord, encode_line
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
 from tsgt.simulation.checks.pose_ages import age_failures
-from tsgt.simulation.checks.recorded_lines import recording_failures
+from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
 from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.mission import MasterLog
@@ -73,6 +73,31 @@ def test_recording_that_ends_early(tmp_path: Path, *, crashed: bool) -> None:
     whole = b"".join(encode_line(record) + b"\n" for record in (HEADER, PARAMETERS, measurement(0), POSE))
     (tmp_path / "a.jsonl").write_bytes(whole[:-9])
     assert bool(list(recording_failures(log))) != crashed
+
+
+@pytest.mark.parametrize(
+    ("change", "count"),
+    [
+        ({}, 0),
+        ({"bytes": 100_000}, 1),
+        ({"bytes": 0}, 1),
+        ({"bytes": 0, "waiting_lines": 9}, 0),
+        ({"file": "b"}, 1),
+    ],
+)
+def test_status_with_a_wrong_size_of_the_recording(
+    tmp_path: Path, change: dict[str, Any], count: int
+) -> None:
+    """The second of two; a pose is written between them."""
+    lines = [encode_line(record) + b"\n" for record in (HEADER, PARAMETERS)]
+    stated = RecordingStatus(file="a.jsonl", bytes=0, last_write_ns=None, waiting_lines=0, lost_lines=0)
+    statuses = []
+    for each in ({}, change):
+        here = replace(stated, **({"bytes": sum(map(len, lines))} | each))
+        statuses.append(replace(STATUS, recording=here))
+        lines += [encode_line(statuses[-1]) + b"\n", encode_line(POSE) + b"\n"]
+    (tmp_path / "a.jsonl").write_bytes(b"".join(lines))
+    assert len(list(size_failures(_log(tmp_path, *statuses)))) == count
 
 
 @pytest.mark.parametrize(

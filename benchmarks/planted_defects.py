@@ -262,6 +262,12 @@ DEFECTS: Final = {
     "lost-event": Defect(
         "a lost station is no event", defects_published.report_no_lost_station, script=silent_station
     ),
+    "outstanding": Defect(
+        "nothing is outstanding by the status",
+        defects_published.state_nothing_outstanding,
+        script=silent_station,
+        duration_s=80,
+    ),
     "queue": Defect(
         "a reader's queue has no bound", defects.unbound_reader_queue, script=sleeping_reader, duration_s=122
     ),

@@ -201,3 +201,12 @@ def report_no_lost_station(planting: Planting) -> None:
         "tick",
         lambda _: lambda _detector, _now_ns, *, realtime_ns: [],  # noqa: ARG005
     )
+
+
+def state_nothing_outstanding(planting: Planting) -> None:
+    """State in the status that no measurement is outstanding."""
+
+    def superframe_state(original: Any) -> Any:
+        return lambda statistics, state: original(statistics, replace(state, outstanding=0))
+
+    planting.replace_attribute(Statistics, "superframe_state", superframe_state)

@@ -23,6 +23,7 @@ from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.imu_samples import imu_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.odometry_samples import odometry_failures
+from tsgt.simulation.checks.outstanding import outstanding_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
 from tsgt.simulation.checks.pose_ages import age_failures
 from tsgt.simulation.checks.pose_consistency import pose_failures
@@ -95,6 +96,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
             )
     found += (Violation("liveness", what) for what in missing_acknowledgements(result, indices))
     found += (Violation("liveness", what) for what in missing_poses(result))
+    found += (Violation("status", what) for what in outstanding_failures(result))
     for master_log in result.master_logs:
         found += (Violation("recording", what) for what in recording_failures(master_log))
         found += (Violation("status", what) for what in size_failures(master_log))

@@ -27,6 +27,7 @@ from tsgt.recording import RecordingStatus, StationStatus, StatusRecord, encode_
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.heard_lines import heard_failures
+from tsgt.simulation.checks.outstanding import outstanding_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
 from tsgt.simulation.checks.pose_ages import age_failures
 from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
@@ -189,6 +190,22 @@ def test_status_that_comes_late(tmp_path: Path) -> None:
         replace(STATUS, stamp_ns=START + at * SECOND, stations=(), poses=0, valid_poses=0) for at in (1, 3)
     )
     assert "2.000 s later" in next(status_failures(_log(tmp_path, first, second), _INDICES))
+
+
+@pytest.mark.parametrize(("stated", "count"), [(10, 0), (13, 0), (0, 1), (400, 1)])
+def test_outstanding_measurements_are_counted(tmp_path: Path, stated: int, count: int) -> None:
+    """Ten have been read and not delivered, in each of 30 statuses."""
+    statuses = [
+        replace(_status(outstanding=stated, joined=True), stamp_ns=START + number * SECOND)
+        for number in range(1, 31)
+    ]
+    log = _log(tmp_path, *map(measurement, range(5)), *statuses)
+    log.arrived_ns = [0] * 5
+    station_log = SimpleNamespace(read_times_ns=dict.fromkeys(range(15), 0) | {15: 10**12})
+    result: Any = SimpleNamespace(
+        faults_end_s=None, superframe=True, master_logs=[log], station_logs={1: station_log}
+    )
+    assert len(list(outstanding_failures(result))) == count
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,9 @@ MAX_PERIOD_NS = 1_500_000_000
 MAX_WRONG_OFFSETS, MIN_OFFSETS = 0.1, 20
 """Share of the clock offsets that may be beyond their bounds: a clock may be stepped between a measurement and the status."""
 
+HEARD_TOLERANCE_S = 0.005
+"""Jitter of the stamps of received packets."""
+
 FRESH_S = 1.0
 """Maximum age of a measurement whose stamp tells the clock offset of the status."""
 
@@ -107,7 +110,10 @@ def _problem(
         since_s = (now_ns - published[-1].received_ns) / 1e9
         if station.locked != locked:
             return f"station {station.id}: locked {station.locked} with the status {station.status}"
-        if station.last_heard_s is None or not -_TOLERANCE <= station.last_heard_s <= since_s + _TOLERANCE:
+        if (
+            station.last_heard_s is None
+            or not -_TOLERANCE <= station.last_heard_s <= since_s + HEARD_TOLERANCE_S
+        ):
             return f"station {station.id}: last heard {station.last_heard_s} s ago, its last measurement came {since_s:.6f} s ago"
     for what, stated, possible in expected:
         if not any(_equal(stated, each) for each in possible):

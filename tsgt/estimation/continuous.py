@@ -23,6 +23,7 @@ from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.setup_uncertainty import InertialSetupUncertainty, setup_jacobian
+from tsgt.estimation.smoothed_ahead import SmoothedAhead
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
@@ -84,6 +85,7 @@ class ContinuousEstimator:
         self._next_epoch_ns: int | None = None
         self._next_smoothed_ns = 0
         self._first_epoch_ns = 0
+        self._ahead = SmoothedAhead(self._limits.period_ns, dim=_POSE_DIM)
         # The oldest epoch first. The window still has the states: a delay is below the lag.
         self._delays_ns = sorted(self._limits.smoothed_delays_ns, reverse=True)
         self.outside_lag_window: Counter[int] = Counter()
@@ -244,7 +246,7 @@ class ContinuousEstimator:
             self._window.converged and not self._window.ambiguous,
             self._converged_at(time_s),
         )
-        states, covariance, common = self._states_at(time_s, predicted)
+        states, covariance, common = self._states_at(stamps_ns, time_s, predicted)
         batch = self._poses.due(
             *rows,
             self._history,
@@ -260,15 +262,17 @@ class ContinuousEstimator:
         return self._with_imu_use(batch)
 
     def _states_at(
-        self, time_s: FloatArray, predicted: NDArray[np.bool_]
+        self, stamps_ns: list[int], time_s: FloatArray, predicted: NDArray[np.bool_]
     ) -> tuple[States, FloatArray, FloatArray | None]:
-        """Return states, their covariance and its common part at times that are predicted, or smoothed."""
+        """Return states, their covariance and its common part at epochs that are predicted, or smoothed."""
         found = [self._window.predict(each_s, dim=_POSE_DIM) for each_s in time_s[predicted].tolist()]
         common = [self._window.common_at(each_s, dim=_POSE_DIM) for each_s in time_s[predicted].tolist()]
         if not predicted.all():
-            trajectory = self._window.smoothed_trajectory()
-            found.append(trajectory.at(time_s[~predicted], dim=_POSE_DIM))
-            common.append(trajectory.common_at(time_s[~predicted], dim=_POSE_DIM))
+            smoothed = self._smoothed_at(
+                [each for each, is_predicted in zip(stamps_ns, predicted, strict=True) if not is_predicted]
+            )
+            found.append(smoothed[:2])
+            common.append(smoothed[2])
         known = [each for each in common if each is not None]
         if len(found) == 1:
             return *found[0], known[0] if known else None
@@ -278,6 +282,15 @@ class ContinuousEstimator:
             np.concatenate([covariance for _, covariance in found])[order],
             np.concatenate(known)[order] if known else None,
         )
+
+    def _smoothed_at(self, stamps_ns: list[int]) -> tuple[States, FloatArray, FloatArray | None]:
+        """Return smoothed states at epochs, their covariance and its common part."""
+        if self._imu is None:
+            trajectory = self._without_imu.smoothed_trajectory()
+            return self._ahead.at(trajectory, stamps_ns, self._origin_ns)
+        time_s = (np.array(stamps_ns, dtype=np.int64) - self._origin_ns) / 1e9
+        inertial = self._window.smoothed_trajectory()
+        return *inertial.at(time_s, dim=_POSE_DIM), inertial.common_at(time_s, dim=_POSE_DIM)
 
     def _converged_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """Whether the trajectory is reliable at times, (N,), that have been smoothed."""

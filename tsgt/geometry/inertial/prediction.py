@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -85,6 +85,9 @@ class StrapdownPredictor:
         self._rotation_predictor = rotation_predictor or RotationPredictor()
         self._dim = len(covariance)
         self._links = [_Link(start, gravity, covariance, np.eye(self._dim))]
+        self._latest: _Link | None = (
+            None  # Beside these: a pose and its common covariance are asked for in turn
+        )
         self._gravity, self._noise, self._mounting, self._motion = gravity, noise, mounting, motion
         self._gyro_only = gyro_only
 
@@ -96,6 +99,7 @@ class StrapdownPredictor:
     def discard_after(self, time_s: float) -> None:
         """Forget what was predicted beyond a time: samples there were missing."""
         self._links[1:] = [link for link in self._links[1:] if link.time_s <= time_s]
+        self._latest = None
 
     def wheels(self, knots: InertialStates, steps: OdometrySteps, duration_s: float) -> WheelsEstimate:
         """Return what the newest state tells of the wheels, with the last steps between knots and beyond, up to a duration."""
@@ -130,11 +134,12 @@ class StrapdownPredictor:
         end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
         link = self._at(end_s, samples, odometry)
         onward_s = time_s - end_s
+        trend = _trend(samples) if onward_s > 0 else None
         turning = self._turning(link.state, samples, onward_s)
-        state, by_error = self._reference_state(link.state, samples, onward_s, turning)
+        state, by_error = self._reference_state(link.state, samples, trend, turning)
         covariance = by_error @ link.covariance @ by_error.T
-        if onward_s > 0:
-            covariance += self._trend_noise(samples, onward_s, turning)
+        if trend is not None:
+            covariance += self._trend_noise(trend, onward_s, turning)
             onward = Propagator(state, covariance, self._motion, process_noise_scale=PREDICTION_NOISE_SCALE)
             return onward.at(time_s, dim=_POSE_DIM)
         covariance = covariance[:_POSE_DIM, :_POSE_DIM]
@@ -147,8 +152,9 @@ class StrapdownPredictor:
         end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
         link = self._at(end_s, samples, odometry)
         onward_s = time_s - end_s
+        trend = _trend(samples) if onward_s > 0 else None
         turning = self._turning(link.state, samples, onward_s)
-        state, by_error = self._reference_state(link.state, samples, onward_s, turning)
+        state, by_error = self._reference_state(link.state, samples, trend, turning)
         by_start: FloatArray = by_error @ link.by_start
         if time_s > end_s:
             onward = Propagator(state, np.zeros((STATE_DIM, STATE_DIM)), self._motion)
@@ -157,12 +163,15 @@ class StrapdownPredictor:
 
     def _at(self, end_s: float, samples: InertialSamples, odometry: Odometry | None) -> _Link:
         """Predict to a time up to the last sample, and keep states on the way."""
+        if self._latest is not None and self._latest.time_s == end_s:
+            return self._latest
         while self._links[-1].time_s + LINK_S <= end_s:
             last = self._links[-1]
             self._links.append(self._onward(last, last.time_s + LINK_S, samples, odometry))
         number = min(int((end_s - self.time_s) / LINK_S), len(self._links) - 1)
         link = self._links[number]
-        return link if link.time_s == end_s else self._onward(link, end_s, samples, odometry)
+        self._latest = link if link.time_s == end_s else self._onward(link, end_s, samples, odometry)
+        return self._latest
 
     def _onward(
         self, link: _Link, end_s: float, samples: InertialSamples, odometry: Odometry | None
@@ -295,15 +304,15 @@ class StrapdownPredictor:
         self,
         state: InertialStates,
         samples: InertialSamples,
-        onward_s: float,
+        trend: _Trend | None,
         turning: PredictedRotation | None,
     ) -> tuple[States, FloatArray]:
         """State of the reference point, with rate and acceleration by the samples, and its Jacobian, (18, D + S).
 
-        ``onward_s``: how long to go on with it beyond the last sample, with the predicted rate if there is one.
+        ``trend``: to go on with it beyond the last sample, with the predicted rate if there is one.
         """
-        if onward_s > 0:
-            rate, force = (each.mean(axis=0) for each in _newest(samples))
+        if trend is not None:
+            rate, force = trend.rate, trend.force
         else:
             row = min(int(samples.end_s.searchsorted(state.time_s[0] - 1e-9)), len(samples) - 1)
             rate, force = samples.angular_rate_radps[row], samples.specific_force_mps2[row]
@@ -335,12 +344,9 @@ class StrapdownPredictor:
         )
         return found, by_error
 
-    def _trend_noise(
-        self, samples: InertialSamples, onward_s: float, turning: PredictedRotation | None
-    ) -> FloatArray:
+    def _trend_noise(self, trend: _Trend, onward_s: float, turning: PredictedRotation | None) -> FloatArray:
         """(18, 18) covariance of the motion that goes on beyond the last sample about that of the last samples."""
-        rates, forces = _newest(samples)
-        rate, force = (float(np.sqrt(each.var(axis=0).mean())) for each in (rates, forces))
+        rate, force = trend.rate_sigma, trend.force_sigma
         angular = np.array(self._motion.angular_acceleration_sigma_radps2)
         linear = np.array(self._motion.acceleration_sigma_mps2)
         # The mean is that of half the span ago.
@@ -362,7 +368,20 @@ class StrapdownPredictor:
         return np.diag(np.square(sigmas.ravel()))
 
 
-def _newest(samples: InertialSamples) -> tuple[FloatArray, FloatArray]:
-    """Rates and forces, (N, 3) each, of the last samples."""
+class _Trend(NamedTuple):
+    """Mean rate and force of the last samples, and one sigma of their components about it."""
+
+    rate: FloatArray  # (3,)
+    force: FloatArray  # (3,)
+    rate_sigma: float
+    force_sigma: float
+
+
+def _trend(samples: InertialSamples) -> _Trend:
     first = int(samples.end_s.searchsorted(samples.end_s[-1] - TREND_SPAN_S + 1e-9))
-    return samples.angular_rate_radps[first:], samples.specific_force_mps2[first:]
+    rates, forces = samples.angular_rate_radps[first:], samples.specific_force_mps2[first:]
+    count = len(rates)
+    rate, force = rates.sum(axis=0) / count, forces.sum(axis=0) / count
+    rates, forces = rates - rate, forces - force
+    squares = float(np.vdot(rates, rates)), float(np.vdot(forces, forces))
+    return _Trend(rate, force, *((each / (3 * count)) ** 0.5 for each in squares))

@@ -76,11 +76,10 @@ class RotationPredictor:
         """
         if self._coefficients is None or self._learnt_s < MIN_LEARNT_S or len(samples) <= self._order:
             return None
-        recent = samples.select(slice(len(samples) - self._order, None))
-        if not self._is_contiguous(recent.end_s):
+        if not self._is_contiguous(samples.end_s[-self._order :]):
             return None
-        rates = recent.angular_rate_radps[::-1]
-        mean = rates.mean(axis=0)
+        rates = samples.angular_rate_radps[: -self._order - 1 : -1]
+        mean = rates.sum(axis=0) / self._order
         rates = rates - mean
         steps = min(duration_s / self._interval_s, float(self._horizon))
         # Linear between whole numbers of samples, and from none.
@@ -134,7 +133,8 @@ class RotationPredictor:
         return min(max(round(SPREAD_S / self._interval_s), 2), self._order)
 
     def _is_contiguous(self, end_s: FloatArray) -> bool:
-        return bool((np.abs(np.diff(end_s) - self._interval_s) < _MAX_JITTER * self._interval_s).all())
+        between_s = end_s[1:] - end_s[:-1]
+        return bool((np.abs(between_s - self._interval_s) < _MAX_JITTER * self._interval_s).all())
 
 
 def _spread(rates: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tsgt.analysis.smoothing import SmoothedRecording
+    from tsgt.analysis.smoothing import SmoothedPoses
     from tsgt.model import MotionPrior
 
 CORRELATION_TIME_S = (0.1, 5.0)
@@ -21,11 +21,11 @@ MAX_ANGULAR_ACCELERATION_RADPS2 = 5.0  # One sigma: from rest to 90 degrees per 
 MIN_MOTION_S = 60.0  # Of a drive that shows what a robot does: a dozen manoeuvres
 
 
-def unfit_for_live(found: SmoothedRecording) -> list[str]:
+def unfit_for_live(found: SmoothedPoses) -> list[str]:
     """Return why the motion prior that was tuned to a recording should not be used live; empty where it may be."""
     if not found.motion.tuned:
         return []
-    time_s = found.fit.observations.time_s
+    time_s = found.observations.time_s
     return implausibilities(found.motion.prior, moving_s=float(time_s[-1] - time_s[0]) - found.rest_s)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Literal
 
-from tsgt.analysis.smoothing import smooth_recording
+from tsgt.analysis.smoothing import smooth_poses
 from tsgt.analysis.validation import (
     MAX_EPOCHS,
     check_prisms_measured,
@@ -40,7 +40,7 @@ def process(
     line.
     """
     if recording.parameters.pipeline.estimator == "continuous":
-        return smooth_recording(recording, path=path, on_progress=on_progress).poses
+        return smooth_poses(recording, path=path, on_progress=on_progress).poses
     parameters = recording.parameters
     pipeline = LinearEstimator(parameters)
     measurements = plausible_measurements(recording)

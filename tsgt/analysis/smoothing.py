@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -33,7 +34,7 @@ from tsgt.estimation import (
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import (
     NOISE_FLOOR_SHARE,
-    fit_trajectory,
+    TrajectoryInPieces,
     overall_scale,
     tune,
     with_noise_floor,
@@ -41,17 +42,19 @@ from tsgt.geometry.batch import (
 from tsgt.geometry.rest import find_rest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from tsgt.analysis.inertial_smoothing import ImuUse
     from tsgt.analysis.refinement import Refine
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.batch import TrajectoryFit
+    from tsgt.geometry.batch import TrajectoryFit, TrajectoryPiece
     from tsgt.geometry.inertial import InertialFit
     from tsgt.geometry.motion_calibration import RefinedSetup
     from tsgt.geometry.rest import RestInterval
-    from tsgt.geometry.trajectory import Observations
+    from tsgt.geometry.trajectory import Observations, Trajectory
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 
@@ -75,18 +78,17 @@ class MotionModel:
     tuned: bool
 
 
-@dataclass(frozen=True, slots=True)
-class SmoothedRecording:
-    """Trajectory fitted to a recording, and its poses at the epochs from the first to the last usable measurement.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmoothedPoses:
+    """Poses at the epochs from the first to the last usable measurement, and what they were computed with.
 
-    ``sources``: measurement of each observation of the fit. ``origin_ns``: Unix time at which its time is zero.
+    ``sources``: measurement of each of the observations.
     """
 
     poses: PoseBatch
-    fit: TrajectoryFit | InertialFit
-    motion: MotionModel
+    observations: Observations  # With the stated noise
     sources: list[Measurement]
-    origin_ns: int
+    motion: MotionModel
     parameters: Parameters  # of the recording, with the set-up that was used
     refinement: RefinedSetup | None  # None: switched off or not possible
     rest: tuple[RestInterval, ...]  # Intervals in which the robot stood still; with an IMU they are not used
@@ -97,6 +99,25 @@ class SmoothedRecording:
     def rest_s(self) -> float:
         """Total duration of rest."""
         return sum(each.end_s - each.start_s for each in self.rest)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmoothedRecording(SmoothedPoses):
+    """The same with the trajectory, which takes most of the memory. ``origin_ns``: Unix time at which its time is zero."""
+
+    fit: TrajectoryFit | InertialFit
+    origin_ns: int
+
+
+def smooth_poses(
+    recording: Recording,
+    *,
+    path: Path,
+    refine: Refine = "auto",
+    on_progress: Callable[[float], None] | None = None,
+) -> SmoothedPoses:
+    """Return the poses of :func:`smooth_recording`, in less memory: no piece of the trajectory outlives its poses."""
+    return _smoothed(recording, path=path, refine=refine, on_progress=on_progress, whole=False)[0]
 
 
 def smooth_recording(
@@ -114,6 +135,21 @@ def smooth_recording(
     are estimated without them. An IMU whose set-up contradicts the measurements is not used. Progress is a fraction, 0 to 1. Raises as :func:`tsgt.analysis.processing.process`, also
     RecordingError if no trajectory fits.
     """
+    found, series, fit = _smoothed(recording, path=path, refine=refine, on_progress=on_progress, whole=True)
+    assert fit is not None  # noqa: S101 (the whole of it was asked for)
+    fields = {name: getattr(found, name) for name in SmoothedPoses.__slots__}
+    return SmoothedRecording(**fields, fit=fit, origin_ns=series.origin_ns)
+
+
+def _smoothed(
+    recording: Recording,
+    *,
+    path: Path,
+    refine: Refine,
+    on_progress: Callable[[float], None] | None,
+    whole: bool,
+) -> tuple[SmoothedPoses, _PoseSeries, TrajectoryFit | InertialFit | None]:
+    """Return the poses, and the trajectory if the ``whole`` of it is to be kept, or an IMU was used."""
     parameters = recording.parameters
     measurements = plausible_measurements(recording)
     with_imu = parameters.imu is not None and bool(recording.imu_samples)
@@ -166,33 +202,45 @@ def smooth_recording(
             if not complete:
                 raise RecordingError(f"{error}; --no-imu leaves the IMU out", path=path) from error
             problem = str(error)
-    without: TrajectoryFit | None = None
+    series = _PoseSeries(parameters, measurements, sources, origin_ns)
+    fit: TrajectoryFit | InertialFit | None = None if imu is None else imu.fit
+    without, rest = None, tuple(find_rest(observations)) if complete and imu is not None else ()
     if imu is None or (complete and imu.unused):
         try:
-            without = fit_trajectory(
+            in_pieces = TrajectoryInPieces(
                 observations,
                 prior=motion.prior,
                 occluded_prior=parameters.pipeline.motion,
                 noise_scale=motion.noise_scales,
                 setup_jacobian=setup_jacobian(parameters),
-                on_progress=on_progress,
             )
+            without, pieces = series.of_pieces(in_pieces, on_progress, keep=whole and imu is None)
+            rest = in_pieces.rest
+            if pieces:
+                fit = in_pieces.joined(pieces)
         except GeometryError as error:
             if imu is None:
                 raise RecordingError(str(error), path=path) from error
     if imu is not None:
         motion = replace(motion, noise_scales=imu.noise_scales, noise_scale=imu.noise_scale)
-    series = _PoseSeries(parameters, measurements, sources, origin_ns)
-    fit: TrajectoryFit | InertialFit
-    if imu is not None:
-        fit, poses = imu.fit, series.with_imu(imu, without)
+        poses = series.with_imu(imu, without)
     else:
         assert without is not None  # noqa: S101 (else an error was raised)
-        fit, poses = without, series.of(without)
+        poses = without
     if not poses.valid.any():
         raise RecordingError(no_valid_pose_message(poses, parameters), path=path)
-    rest = without.rest if without is not None else tuple(find_rest(observations)) if complete else ()
-    return SmoothedRecording(poses, fit, motion, sources, origin_ns, parameters, refined, rest, imu, problem)
+    found = SmoothedPoses(
+        poses=poses,
+        observations=observations,
+        sources=sources,
+        motion=motion,
+        parameters=parameters,
+        refinement=refined,
+        rest=rest,
+        imu=imu,
+        imu_problem=problem,
+    )
+    return found, series, fit
 
 
 def estimate_motion_model(
@@ -237,10 +285,13 @@ class _PoseSeries:
         sources: Sequence[Measurement],
         origin_ns: int,
     ) -> None:
+        self.origin_ns = origin_ns
         stations = {station.station: station for station in parameters.stations}
-        self._parameters, self._origin_ns = parameters, origin_ns
+        columns = {prism.prism: column for column, prism in enumerate(parameters.prisms)}
+        self._parameters, self._output = parameters, ContinuousPoseOutput(parameters)
         self._times_ns = np.array([measured_at_ns(m, stations[m.station]) for m in sources], dtype=np.int64)
         self._stations = np.array([m.station for m in sources], dtype=np.int64)
+        self._prisms = np.array([columns[m.prism] for m in sources], dtype=np.intp)
         self._unusable_ns = [
             np.array(
                 sorted(
@@ -252,41 +303,79 @@ class _PoseSeries:
             )
             for prism in parameters.prisms
         ]
+        period_ns = parameters.pipeline.period_ns
+        first, last = -(-int(self._times_ns[0]) // period_ns), int(self._times_ns[-1]) // period_ns
+        self._epochs_ns = np.arange(first, last + 1, dtype=np.int64) * period_ns
 
-    def with_imu(self, imu: ImuUse, without: TrajectoryFit | None) -> PoseBatch:
+    def with_imu(self, imu: ImuUse, without: PoseBatch | None) -> PoseBatch:
         """Return poses with an IMU; where it is not to be used those without it, or invalid ones."""
-        poses = self.of(imu.fit, imu)
+        seen = self._history(imu.fit.residuals_m)
+
+        def chunk(epochs_ns: NDArray[np.int64]) -> PoseBatch:
+            time_s = self._time_s(epochs_ns)
+            states, covariance, common = imu.fit.trajectory.poses_at(time_s)
+            converged = ~imu.unused_at(time_s)
+            return self._output.smoothed(
+                epochs_ns, seen, states, covariance, common=common, converged=converged
+            )
+
+        poses = PoseBatch.collected(len(self._epochs_ns), map(chunk, _chunks(self._epochs_ns)))
         if without is None:
             return poses
-        unused = imu.unused_at((poses.stamp_ns - self._origin_ns) / 1e9)
-        other = self.of(without)
+        unused = imu.unused_at(self._time_s(poses.stamp_ns))
         rows = np.concatenate([np.flatnonzero(~unused), len(poses) + np.flatnonzero(unused)])
-        joined = PoseBatch.concatenated([poses, other]).select(rows)
+        joined = PoseBatch.concatenated([poses, without]).select(rows)
         return joined.select(np.argsort(joined.stamp_ns, kind="stable"))
 
-    def of(self, found: TrajectoryFit | InertialFit, imu: ImuUse | None = None) -> PoseBatch:
-        """Return the poses of a trajectory; invalid where its IMU is not to be used."""
-        seen = MeasurementHistory(
+    def of_pieces(
+        self, in_pieces: TrajectoryInPieces, on_progress: Callable[[float], None] | None, *, keep: bool
+    ) -> tuple[PoseBatch, list[TrajectoryPiece]]:
+        """Return the poses of a trajectory, computed piece by piece, and the pieces if they are to be kept."""
+        kept: list[TrajectoryPiece] = []
+
+        def chunks() -> Iterator[PoseBatch]:
+            residuals_m, measured, done = np.full((len(self._times_ns), 3), np.nan), 0, 0
+            # A pose looks at residuals before and after it, so that a piece waits for the next one.
+            previous: TrajectoryPiece | None = None
+            for piece in itertools.chain(in_pieces.fitted(on_progress), [None]):
+                if piece is not None:
+                    residuals_m[measured : measured + len(piece.residuals_m)] = piece.residuals_m
+                    measured += len(piece.residuals_m)
+                    if keep:
+                        kept.append(piece)
+                if previous is not None:
+                    until_s = np.inf if piece is None else piece.trajectory.knots.time_s[0]
+                    stop = int(np.searchsorted(self._time_s(self._epochs_ns), until_s))
+                    yield from self._of_piece(previous.trajectory, self._epochs_ns[done:stop], residuals_m)
+                    done = stop
+                previous = piece
+
+        return PoseBatch.collected(len(self._epochs_ns), chunks()), kept
+
+    def _of_piece(
+        self, trajectory: Trajectory, epochs_ns: NDArray[np.int64], residuals_m: FloatArray
+    ) -> Iterator[PoseBatch]:
+        seen = self._history(residuals_m)
+        for some_ns in _chunks(epochs_ns):
+            time_s = self._time_s(some_ns)
+            states, covariance = trajectory.at(time_s, dim=_POSE_DIM)
+            common = trajectory.common_at(time_s, dim=_POSE_DIM)
+            yield self._output.smoothed(some_ns, seen, states, covariance, common=common)
+
+    def _time_s(self, epochs_ns: NDArray[np.int64]) -> FloatArray:
+        """Return the times of epochs from the trajectory's origin."""
+        return np.asarray((epochs_ns - self.origin_ns) / 1e9)
+
+    def _history(self, residuals_m: FloatArray) -> MeasurementHistory:
+        return MeasurementHistory(
             times_ns=self._times_ns,
             stations=self._stations,
-            prisms=found.observations.prism,
-            residuals_m=np.linalg.norm(found.residuals_m, axis=1),
+            prisms=self._prisms,
+            residuals_m=np.linalg.norm(residuals_m, axis=1),
             unusable_ns=self._unusable_ns,
         )
-        period_ns = self._parameters.pipeline.period_ns
-        first, last = -(-int(seen.times_ns[0]) // period_ns), int(seen.times_ns[-1]) // period_ns
-        epochs_ns = np.arange(first, last + 1, dtype=np.int64) * period_ns
-        chunks, output = [], ContinuousPoseOutput(self._parameters)
-        for start in range(0, max(len(epochs_ns), 1), _EPOCHS_PER_CHUNK):
-            some_ns = epochs_ns[start : start + _EPOCHS_PER_CHUNK]
-            time_s = (some_ns - self._origin_ns) / 1e9
-            if imu is None:
-                states, covariance = found.trajectory.at(time_s, dim=_POSE_DIM)
-                common, converged = found.trajectory.common_at(time_s, dim=_POSE_DIM), None
-            else:
-                states, covariance, common = imu.fit.trajectory.poses_at(time_s)
-                converged = ~imu.unused_at(time_s)
-            chunks.append(
-                output.smoothed(some_ns, seen, states, covariance, common=common, converged=converged)
-            )
-        return PoseBatch.concatenated(chunks)
+
+
+def _chunks(epochs_ns: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    for start in range(0, max(len(epochs_ns), 1), _EPOCHS_PER_CHUNK):
+        yield epochs_ns[start : start + _EPOCHS_PER_CHUNK]

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.evaluation import Reference
     from tsgt.analysis.processing import Estimator
-    from tsgt.analysis.smoothing import SmoothedRecording
+    from tsgt.analysis.smoothing import SmoothedPoses
     from tsgt.estimation import PoseBatch
     from tsgt.model import MotionPrior, Parameters, ReferencePoint
     from tsgt.recording import Recording
@@ -240,19 +240,19 @@ def duration_s(poses: PoseBatch) -> float:
     return int(poses.stamp_ns[-1] - poses.stamp_ns[0]) / 1e9
 
 
-def motion_keys(found: SmoothedRecording) -> dict[str, Any]:
+def motion_keys(found: SmoothedPoses) -> dict[str, Any]:
     """Return motion prior and noise scales for ``--json``."""
     motion = found.motion
     return {
         "motion": dataclasses.asdict(motion.prior),
         "noise_scale": motion.noise_scale,
-        "noise_scales": noise_scales_by_axis(found.fit.observations, motion.noise_scales, found.sources),
+        "noise_scales": noise_scales_by_axis(found.observations, motion.noise_scales, found.sources),
         "motion_tuned": motion.tuned,
         "motion_unfit_for_live": unfit_for_live(found),
     }
 
 
-def imu_text(found: SmoothedRecording) -> str | None:
+def imu_text(found: SmoothedPoses) -> str | None:
     """Return in words how the IMU was used; None without one."""
     if found.imu is None:
         return f"IMU: not used: {found.imu_problem}" if found.imu_problem else None
@@ -270,7 +270,7 @@ def imu_text(found: SmoothedRecording) -> str | None:
     return text
 
 
-def motion_text(found: SmoothedRecording, configured: MotionPrior) -> str:
+def motion_text(found: SmoothedPoses, configured: MotionPrior) -> str:
     """Return motion prior and noise scale as they are written in a master's configuration; ``configured``: as recorded."""
     motion = found.motion
     if found.imu is not None and not motion.tuned:

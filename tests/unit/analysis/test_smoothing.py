@@ -11,7 +11,7 @@ from harness.scene import LAYOUT, SECOND, START, Motion, stationary_scene, with_
 from tsgt.analysis.evaluation import held_out_errors
 from tsgt.analysis.evaluation.held_out import FOLDS
 from tsgt.analysis.processing import process, with_estimator
-from tsgt.analysis.smoothing import smooth_recording
+from tsgt.analysis.smoothing import smooth_poses, smooth_recording
 from tsgt.errors import RecordingError
 from tsgt.estimation import Kind, Reason, build_observations
 from tsgt.geometry import exp_so3, rotate, rotation_from_quaternion, skew
@@ -102,6 +102,18 @@ def test_process_uses_the_estimator_of_the_recording() -> None:
     np.testing.assert_array_equal(
         process(recording, path=PATH).position_m, smooth_recording(recording, path=PATH).poses.position_m
     )
+
+
+def test_poses_of_pieces_equal_those_of_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every pose, also those between two pieces, to a hundredth of a millimetre."""
+    recording = recording_of(drive(8.0))
+    one = smooth_poses(recording, path=PATH, refine="off").poses
+    monkeypatch.setattr("tsgt.geometry.batch.fit.KNOTS_PER_SEGMENT", 20)
+    several = smooth_poses(recording, path=PATH, refine="off").poses
+    np.testing.assert_array_equal(several.stamp_ns, one.stamp_ns)
+    np.testing.assert_allclose(several.position_m, one.position_m, atol=1e-5)
+    np.testing.assert_allclose(several.covariance, one.covariance, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(several.prism_residual_m, one.prism_residual_m, atol=1e-5)
 
 
 @pytest.mark.slow

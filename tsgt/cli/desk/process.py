@@ -12,7 +12,7 @@ from tsgt.analysis.formats import pose_csv, tum_lines, valid_rows
 from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.processing import process as process_recording
 from tsgt.analysis.refinement import refinement_keys, refinement_text
-from tsgt.analysis.smoothing import smooth_recording
+from tsgt.analysis.smoothing import smooth_poses
 from tsgt.cli.options import (
     FiniteRange,
     json_option,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.refinement import Refine
-    from tsgt.analysis.smoothing import SmoothedRecording
+    from tsgt.analysis.smoothing import SmoothedPoses
     from tsgt.cli.recordings import ImuOptions
     from tsgt.estimation import PoseBatch
     from tsgt.model import Parameters, ReferencePoint
@@ -164,13 +164,13 @@ def process(
 
 def _processed(
     loaded: Recording, path: Path, refine: Refine
-) -> tuple[PoseBatch, Parameters, SmoothedRecording | None]:
+) -> tuple[PoseBatch, Parameters, SmoothedPoses | None]:
     """Return the poses, the parameters that they were computed with, and the trajectory of ``continuous``."""
     parameters = loaded.parameters
     if parameters.pipeline.estimator == "linear":
         return process_recording(loaded, path=path), parameters, None
     with progress("fitting", first=TUNING) as on_progress:
-        found = smooth_recording(loaded, path=path, refine=refine, on_progress=on_progress)
+        found = smooth_poses(loaded, path=path, refine=refine, on_progress=on_progress)
     motion = found.motion
     pipeline = dataclasses.replace(parameters.pipeline, motion=motion.prior)
     parameters = dataclasses.replace(found.parameters, pipeline=pipeline)

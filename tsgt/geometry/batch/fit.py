@@ -1,8 +1,9 @@
 """Batch estimation: the trajectory of a whole recording of any length. Sans-I/O.
 
 A long recording is solved in overlapping segments, which bounds the memory for the equations; measurements half a minute
-away carry no information about a state, so that the result equals that of one segment to far below the noise. The result
-takes about 140 MB per hour of 3 stations at 2.5 Hz, and 280 MB with the part of the covariance that the states share.
+away carry no information about a state, so that the result equals that of one segment to far below the noise. The whole
+takes about 140 MB per hour of 3 stations at 2.5 Hz, and 280 MB with the part of the covariance that the states share; who
+asks for poses alone takes it piece by piece.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from tsgt.geometry.trajectory.states import concatenate_states
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -52,7 +53,7 @@ KNOTS_PER_SEGMENT = 1024  # About two minutes of 3 stations at 2.5 Hz: their blo
 MAX_ADAPTED_ITERATIONS = (
     6  # From the solution before the last adaptation, which is close; two or three suffice
 )
-OVERLAP_KNOTS = 128  # Knots on either side of a segment that are solved with it and discarded
+OVERLAP_KNOTS = 96  # Knots on either side of a segment that are solved with it and discarded
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,17 @@ class TrajectoryFit:
     def rest_s(self) -> float:
         """Total duration of rest."""
         return sum(each.end_s - each.start_s for each in self.rest)
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryPiece:
+    """A piece of a trajectory, and the measurements that are attached to its knots."""
+
+    trajectory: Trajectory  # Its own knots and, except in the last piece, the first one of the next
+    knots: int  # Of its own
+    residuals_m: FloatArray  # (m, 3) fields as of :class:`TrajectoryFit`
+    squared_distances: FloatArray  # (m,)
+    weights: FloatArray  # (m,)
 
 
 class _Segment(NamedTuple):
@@ -110,73 +122,124 @@ def fit_trajectory(
     setup_jacobian : Sensitivity to the set-up's errors, for the part of the covariance that all states share.
     on_progress : Called with the completed share of the work, 0 to 1.
     """
-    report_progress = on_progress or (lambda _: None)
     if prior is None or noise_scale is None:
         tuned = tune(observations, start=prior, noise_scale=noise_scale, noise_only=prior is not None)
         noise_scale = tuned.noise_scales
         if prior is None:
             prior = with_noise_floor(tuned.prior, MotionPrior(), NOISE_FLOOR_SHARE)
             occluded_prior = occluded_prior or MotionPrior()
-    scales = np.ones((len(observations.frames), 3)) * noise_scale
-    rest = tuple(find_rest(observations) if rest is None else rest)
-    observations = with_vibration(scale_noise(observations, scales), rest, observations.sigmas_m)
-    times_s = knot_times(observations.time_s)
-    knot_index = nearest_knots(times_s, observations.time_s)
-    occluded = partially_occluded(observations.time_s, observations.prism, 0.5 * (times_s[:-1] + times_s[1:]))
-    occluded_sigmas = axis_sigmas(with_noise_floor(prior, occluded_prior or prior))
-    sigmas = np.where(occluded[:, None], occluded_sigmas, axis_sigmas(prior))
-    sigmas, rest_information = rest_factors(rest, times_s, sigmas, observations.layout)
-    adaptable = ~occluded & ~steps_in_rest(rest, times_s)
-    segments = _segments(len(times_s))
-    tracks = PrismTracks.of(observations)
-    knots, covariances, cross_covariances, residuals_m, squared_distances, weights = [], [], [], [], [], []
-    adapted = sigmas.copy()
-    displacements: list[FloatArray] = []
-    for completed, segment in enumerate(segments):
-        report_progress(completed / len(segments))
-        rows = slice(*np.searchsorted(knot_index, (segment.solved.start, segment.solved.stop)))
-        steps = slice(segment.solved.start, segment.solved.stop - 1)
-        found = _solve_adapting(
-            observations.select(rows),
-            tracks.guess(times_s[segment.solved]),
-            prior,
-            sigmas[steps],
-            None if rest_information is None else rest_information[steps],
-            adaptable[steps],
-        )
-        solution, covariance, cross_covariance = found.solution, found.covariance, found.cross_covariance
-        kept_steps = slice(segment.kept.start, min(segment.kept.stop, len(adapted)))
-        adapted[kept_steps] = found.sigmas[kept_steps.start - steps.start : kept_steps.stop - steps.start]
-        kept_knots = slice(
-            segment.kept.start - segment.solved.start, segment.kept.stop - segment.solved.start
-        )
-        if setup_jacobian is not None:
-            displacements.append(
-                _displacement(solution, observations.select(rows), setup_jacobian)[kept_knots]
-            )
-        knots.append(solution.knots.select(kept_knots))
-        covariances.append(covariance[kept_knots])
-        cross_covariances.append(cross_covariance[kept_knots])
-        kept = slice(*np.searchsorted(knot_index[rows], (segment.kept.start, segment.kept.stop)))
-        # Keep only these parts: the solution's factor is as large as the rest.
-        residuals_m.append(solution.linearised.residuals_m[kept])
-        squared_distances.append(solution.squared_distances[kept])
-        weights.append(solution.weights[kept])
-    report_progress(1.0)
-    covariance = np.concatenate(covariances)
-    cross_covariance = np.concatenate(cross_covariances)[: len(times_s) - 1]
-    add_vibration(rest, times_s, observations.layout, covariance, cross_covariance)
-    common = common_covariance(np.concatenate(displacements)) if displacements else None
-    trajectory = Trajectory(concatenate_states(knots), prior, covariance, cross_covariance, adapted, common)
-    return TrajectoryFit(
-        trajectory,
+    in_pieces = TrajectoryInPieces(
         observations,
-        scales,
-        np.concatenate(residuals_m),
-        np.concatenate(squared_distances),
-        np.concatenate(weights),
-        rest,
+        prior=prior,
+        occluded_prior=occluded_prior,
+        noise_scale=noise_scale,
+        rest=rest,
+        setup_jacobian=setup_jacobian,
     )
+    return in_pieces.joined(list(in_pieces.fitted(on_progress)))
+
+
+class TrajectoryInPieces:
+    """The same, one piece of a few minutes at a time, which takes little memory; parameters of :func:`fit_trajectory`.
+
+    ``observations``: with the noise that the fit uses. ``noise_scales``, ``rest``: as of :class:`TrajectoryFit`.
+    """
+
+    def __init__(
+        self,
+        observations: Observations,
+        *,
+        prior: MotionPrior,
+        noise_scale: FloatArray | float,
+        occluded_prior: MotionPrior | None = None,
+        rest: Sequence[RestInterval] | None = None,
+        setup_jacobian: SetupJacobian | None = None,
+    ) -> None:
+        self.noise_scales = np.ones((len(observations.frames), 3)) * noise_scale
+        self.rest = tuple(find_rest(observations) if rest is None else rest)
+        self.observations = with_vibration(
+            scale_noise(observations, self.noise_scales), self.rest, observations.sigmas_m
+        )
+        self._prior, self._setup_jacobian = prior, setup_jacobian
+        self._times_s = times_s = knot_times(observations.time_s)
+        self._knot_index = nearest_knots(times_s, observations.time_s)
+        middle_s = 0.5 * (times_s[:-1] + times_s[1:])
+        occluded = partially_occluded(observations.time_s, observations.prism, middle_s)
+        occluded_sigmas = axis_sigmas(with_noise_floor(prior, occluded_prior or prior))
+        sigmas = np.where(occluded[:, None], occluded_sigmas, axis_sigmas(prior))
+        self._sigmas, self._rest_information = rest_factors(self.rest, times_s, sigmas, observations.layout)
+        self._adaptable = ~occluded & ~steps_in_rest(self.rest, times_s)
+        self._segments = _segments(len(times_s))
+        self._tracks = PrismTracks.of(self.observations)
+
+    def fitted(self, on_progress: Callable[[float], None] | None = None) -> Iterator[TrajectoryPiece]:
+        """Yield the pieces in the order of time. Raises GeometryError as :func:`fit_trajectory`."""
+        report_progress = on_progress or (lambda _: None)
+        for completed, segment in enumerate(self._segments):
+            report_progress(completed / len(self._segments))
+            yield self._fit(segment)
+        report_progress(1.0)
+
+    def joined(self, pieces: Sequence[TrajectoryPiece]) -> TrajectoryFit:
+        """Return the whole trajectory from all of its pieces."""
+        each = [piece.trajectory for piece in pieces]
+        own = [slice(piece.knots) for piece in pieces]
+        commons = [trajectory.common for trajectory in each if trajectory.common is not None]
+        trajectory = Trajectory(
+            concatenate_states([t.knots.select(rows) for t, rows in zip(each, own, strict=True)]),
+            self._prior,
+            np.concatenate([t.covariance[rows] for t, rows in zip(each, own, strict=True)]),
+            np.concatenate([t.cross_covariance for t in each]),
+            np.concatenate([t.sigmas for t in each if t.sigmas is not None]),
+            None
+            if not commons
+            else (
+                np.concatenate([of_knots[rows] for (of_knots, _), rows in zip(commons, own, strict=True)]),
+                np.concatenate([of_steps for _, of_steps in commons]),
+            ),
+        )
+        return TrajectoryFit(
+            trajectory,
+            self.observations,
+            self.noise_scales,
+            np.concatenate([piece.residuals_m for piece in pieces]),
+            np.concatenate([piece.squared_distances for piece in pieces]),
+            np.concatenate([piece.weights for piece in pieces]),
+            self.rest,
+        )
+
+    def _fit(self, segment: _Segment) -> TrajectoryPiece:
+        first, last = segment.solved.start, segment.solved.stop
+        rows = slice(*np.searchsorted(self._knot_index, (first, last)))
+        steps = slice(first, last - 1)
+        observations = self.observations.select(rows)
+        rest = None if self._rest_information is None else self._rest_information[steps]
+        guess = self._tracks.guess(self._times_s[segment.solved])
+        found = _solve_adapting(
+            observations, guess, self._prior, self._sigmas[steps], rest, self._adaptable[steps]
+        )
+        solution = found.solution
+        start, stop = segment.kept.start - first, segment.kept.stop - first
+        # With the next knot, up to which the states of this piece are asked for. Copies, or all of the segment would be kept.
+        some = slice(start, stop + 1)
+        covariance = found.covariance[some].copy()
+        between = slice(start, start + len(covariance) - 1)
+        cross_covariance = found.cross_covariance[between].copy()
+        times_s = self._times_s[first:last][some]
+        add_vibration(self.rest, times_s, observations.layout, covariance, cross_covariance)
+        common = None
+        if self._setup_jacobian is not None:
+            displaced = _displacement(solution, observations, self._setup_jacobian)
+            common = common_covariance(displaced[some])
+        knots, sigmas = solution.knots.select(some), found.sigmas[between]
+        measured = slice(*np.searchsorted(self._knot_index[rows], (segment.kept.start, segment.kept.stop)))
+        return TrajectoryPiece(
+            Trajectory(knots, self._prior, covariance, cross_covariance, sigmas, common),
+            stop - start,
+            solution.linearised.residuals_m[measured].copy(),
+            solution.squared_distances[measured].copy(),
+            solution.weights[measured].copy(),
+        )
 
 
 class _AdaptedSolution(NamedTuple):

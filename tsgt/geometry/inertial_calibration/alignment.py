@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.signal import correlate
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.fft import irfft, next_fast_len, rfft
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.rigid import matvec
@@ -183,7 +183,10 @@ def _rate_scores(
     a, b = robot.rate * known[:, None], imu.rate * theirs[:, None]
 
     def correlated(x: FloatArray, y: FloatArray) -> FloatArray:
-        return np.asarray(correlate(y, x, mode="full", method="fft"))
+        # Not scipy.signal, nor its ndimage below: to import them takes longer than all else of this module.
+        length = len(x) + len(y) - 1
+        size = next_fast_len(length, real=True)
+        return np.asarray(irfft(rfft(y, size) * rfft(x[::-1], size), size))[:length]
 
     count = np.maximum(correlated(known, theirs), 0.5)
     sum_a = np.stack([correlated(a[:, i], theirs) for i in range(3)], axis=1)
@@ -239,6 +242,7 @@ def _smoothed(
 
     def smoothed(values: FloatArray) -> FloatArray:
         on_grid = np.stack([np.interp(grid_s, time_s, each) for each in values.T], axis=1)
-        return np.asarray(uniform_filter1d(on_grid, width, axis=0, mode="nearest"))
+        padded = np.pad(on_grid, ((width // 2, (width - 1) // 2), (0, 0)), mode="edge")
+        return np.asarray(sliding_window_view(padded, width, axis=0).mean(axis=-1))
 
     return Series(start_s, smoothed(rate), smoothed(force), known)

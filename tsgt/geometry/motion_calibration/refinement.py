@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from tsgt.geometry.batch import tune
 from tsgt.geometry.motion_calibration.hypotheses import Hypothesis, hypotheses
@@ -270,4 +270,4 @@ def _p_value(total: Information, nominal: FloatArray, wide: FloatArray) -> float
     gradient = directions.T @ total.vector
     projected = directions.T @ total.matrix
     covariance = projected @ directions + projected @ nominal @ (projected @ nominal).T
-    return float(chi2.sf(gradient @ np.linalg.solve(covariance, gradient), len(gradient)))
+    return float(chdtrc(len(gradient), gradient @ np.linalg.solve(covariance, gradient)))

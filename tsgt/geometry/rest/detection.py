@@ -108,7 +108,8 @@ def _outliers(series: Series) -> NDArray[np.bool_]:
         rows = np.flatnonzero(series.series == number)
         if len(rows) < 5:
             continue
-        median = np.median(np.lib.stride_tricks.sliding_window_view(series.values[rows], 5, axis=0), axis=-1)
+        windows = np.lib.stride_tricks.sliding_window_view(series.values[rows], 5, axis=0)
+        median = np.sort(windows, axis=-1)[..., 2]
         limit = np.maximum(_HAMPEL_SIGMAS, _HAMPEL_VIBRATIONS * MAX_VIBRATION_M / series.sigmas_m[rows[2:-2]])
         far = np.abs(series.values[rows[2:-2]] - median) > limit * series.sigmas[rows[2:-2]]
         outliers[rows[2:-2]] = far.any(axis=1)
@@ -160,7 +161,7 @@ class _Windows:
             of_each = rows[own == each]
             if not len(of_each):
                 continue
-            values[of_each] -= np.median(values[of_each], axis=0)
+            values[of_each] -= _median(values[of_each])
             variances = series.sigmas[of_each] ** 2
             steps[of_each[1:]] = np.diff(values[of_each], axis=0) ** 2 / (variances[1:] + variances[:-1])
             self._next[:, each] = np.append(of_each, count)[np.searchsorted(of_each, np.arange(count + 1))]
@@ -246,6 +247,13 @@ class _Statistics(NamedTuple):
     scatter: FloatArray  # Variance about the trends over the stated one
     creep: FloatArray  # Chi-square that a speed of 1 m/s would add to the trends, in the direction that is measured worst
     vibration_m2: FloatArray
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """Median of each column; for a few dozen rows a quarter of the time of numpy's."""
+    ordered, count = np.sort(values, axis=0), len(values)
+    median: FloatArray = 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
+    return median
 
 
 def _is_white(steps: FloatArray, scatter: FloatArray, freedom: FloatArray) -> NDArray[np.bool_]:

@@ -171,7 +171,7 @@ class StationEventDetector:
                 station.lost = True
                 text = (
                     f"has not responded for {(now_ns - station.received_ns) / 1e9:.0f} s; run `tsgt status` on its "
-                    "computer to see whether it receives this master"
+                    "computer to see whether it receives this master, and on the others to see that none has its number"
                 )
                 events.append(_event(now_ns, "station_lost", text, number))
         difference_ns = realtime_ns - now_ns

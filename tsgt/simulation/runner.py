@@ -113,7 +113,7 @@ def simulate(
             parameters=mission.parameters,
             world=mission.world,
             duration_s=options.duration_s,
-            master_logs=mission.master_logs,
+            master_logs=[*mission.other_master_logs, *mission.master_logs],
             station_logs=mission.station_logs,
             airtime_s=airtime_s,
             superframe=isinstance(options.protocol, SuperframeMasterConfig),

@@ -38,7 +38,7 @@ ALARMS = frozenset(
     {
         "station_lost", "battery_low", "radio_failed", "geofence_exited", "layout_residual_high", "imu_setup_wrong", "imu_lost",
         "beacon_time_rejected", "link_delay_anomaly", "unauthenticated", "station_contradicted", "disk_full", "disk_failed",
-        "setup_missing", "setup_rejected",
+        "setup_missing", "setup_rejected", "other_master",
     }
 )  # fmt: skip
 """Events that need the operator."""

@@ -15,6 +15,7 @@ from tsgt.radio import SearchCommand, TrackCommand
 from tsgt.radio.superframe import FrameTiming, PhaseLock, SuperframeMaster
 from tsgt.radio.superframe.wire import Authenticator
 from tsgt.recording import BeaconRecord
+from tsgt.service import LogLimiter
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -81,6 +82,8 @@ class SuperframeLink:
         self._track_commanded_ns: dict[int, int] = {}
         self._directions: dict[int, Direction] = {}
         self._beacons_ns: deque[int] = deque(maxlen=16)
+        self._other_beacons = 0
+        self._log_limiter = LogLimiter()
         self.exchange_start_ns: int | None = None
         if key is None:
             log.warning("unauthenticated", key_file=protocol.key_file)
@@ -154,6 +157,14 @@ class SuperframeLink:
         """Report the stations whose slots stayed empty."""
         for station in stations:
             self._report(link_events.NoResponse(station))
+        if self._master.other_beacons != self._other_beacons:
+            self._other_beacons = self._master.other_beacons
+            if self._log_limiter.allows("other_master", self._clock.monotonic_ns()):
+                message = (
+                    "beacons of another session arrive that have this master's key: switch the other master off, "
+                    "or somebody replays recorded packets"
+                )
+                self._report(link_events.MasterEvent("other_master", message))
 
     # ----------------------------------------------------------------------------------------------------------------
 

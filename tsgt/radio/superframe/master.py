@@ -17,6 +17,7 @@ from tsgt.errors import MessageError
 from tsgt.radio.airtime import TX_DONE_NS, symbol_time_ns
 from tsgt.radio.superframe.demand import DEFAULT_GRANT, DemandEstimator, max_grant, retry_stations
 from tsgt.radio.superframe.reception import ReplyTiming
+from tsgt.radio.superframe.session import full_counter
 from tsgt.radio.superframe.slots import EXACT_SIGMA_NS, GUARD_UNIT_NS, slot_sequence
 from tsgt.radio.superframe.station_state import StationState
 from tsgt.radio.superframe.timing import StationTiming
@@ -28,6 +29,7 @@ from tsgt.radio.superframe.wire import (
     SessionInfo,
     SlotOrder,
     StationEntry,
+    decode_beacon,
     decode_reply,
     encode_beacon,
 )
@@ -81,6 +83,7 @@ class SuperframeMaster:
 
     ``session``, ``counter``: session nonce, and frame counter in the session; -1 before the first frame.
     ``rejected_packets``: packets that were not a reply to the present beacon: of others, forged, late, repeated.
+    ``other_beacons``: of these, authentic beacons of another session: another master with this key, or recorded ones.
 
     Parameters
     ----------
@@ -126,7 +129,7 @@ class SuperframeMaster:
         self._records = records
         self._slot_order = SlotOrder()
         self._frame = self._next = _initial_frame(now_ns)
-        self.rejected_packets = 0
+        self.rejected_packets = self.other_beacons = 0
         self.session = random_bits(NONCE_BITS)
         self.counter = -1
 
@@ -208,8 +211,25 @@ class SuperframeMaster:
         received = None
         if frame.sent_ns is not None and received_ns > frame.sent_ns:
             received = self._take_reply(frame, frame.sent_ns, payload, received_ns, sigma_ns)
-        self.rejected_packets += received is None
+        if received is None:
+            self.rejected_packets += 1
+            self.other_beacons += self._is_other_beacon(payload)
         return received
+
+    def _is_other_beacon(self, payload: bytes) -> bool:
+        """Whether a packet is an authentic beacon of another session; told by those with session info only."""
+        content, code = payload[:-CODE_BYTES], payload[-CODE_BYTES:]
+        try:
+            beacon = decode_beacon(content)
+        except MessageError:
+            return False
+        info = beacon.session
+        if info is None or info.nonce == self.session:
+            return False
+        expected = self._authenticator.beacon_code(
+            session=info.nonce, counter=full_counter(info, beacon), content=content
+        )
+        return hmac.compare_digest(expected, code)
 
     def _take_reply(
         self, frame: _Frame, sent_ns: int, payload: bytes, received_ns: int, sigma_ns: int

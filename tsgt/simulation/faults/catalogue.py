@@ -114,9 +114,34 @@ class FaultKind(StrEnum):
     """A station's computer reboots, and NTP sets its Unix clock, which stood still for the time without power, some seconds later."""
     NTP_SLEW = "ntp-slew"
     """NTP slews a station's clock by 500 ppm, CLOCK_MONOTONIC as well."""
+    WRONG_KEY = "wrong-key"
+    """A client is started with another key, until the operator has found it."""
+    OTHER_SPREADING_FACTOR = "other-spreading-factor"
+    """A client's radio is configured with another spreading factor, until the operator has found it."""
+    OTHER_PROTOCOL = "other-protocol"
+    """A client is configured for classic in a mission with superframe, until the operator has found it."""
+    UNKNOWN_STATION = "unknown-station"
+    """A client is configured as a station that the master does not know, until the operator has found it."""
+    SAME_STATION = "same-station"
+    """A client is configured as a station that another client already is, until the operator has found it."""
+    PRISM_CONSTANT = "prism-constant"
+    """An instrument adds 34.4 mm, the constant of its prism, and the master, too, until the operator has found it."""
+    SECOND_MASTER = "second-master"
+    """Another master with the same key and stations is switched on beside the robot's."""
 
 
 # Further kinds come last: the draws of the others stay the same. Kinds from SLOW_DISK on have a generator each.
+
+
+SETUP_MISTAKES: Final = (
+    FaultKind.WRONG_KEY,
+    FaultKind.OTHER_SPREADING_FACTOR,
+    FaultKind.OTHER_PROTOCOL,
+    FaultKind.UNKNOWN_STATION,
+    FaultKind.SAME_STATION,
+    FaultKind.PRISM_CONSTANT,
+)
+"""What an operator sets up wrongly at a station."""
 
 
 class _FaultRate(NamedTuple):
@@ -168,6 +193,8 @@ _RATES: Final = {
     FaultKind.SUSPEND: _FaultRate(4, _S, (0.05, 30)),
     FaultKind.NTP_BOOT_STEP: _FaultRate(2, _S, (1, 20)),
     FaultKind.NTP_SLEW: _FaultRate(4, _S, (2, 40)),
+    **dict.fromkeys(SETUP_MISTAKES, _FaultRate(2, _S, (20, 120))),
+    FaultKind.SECOND_MASTER: _FaultRate(4, _M, (5, 60)),
 }
 
 RATE_FACTOR = 3.0
@@ -192,7 +219,7 @@ ODOMETRY_FAULTS: Final = frozenset(kind for kind, rate in _RATES.items() if rate
 """Kinds of faults that only a robot with wheel odometry has."""
 
 
-FIELD_DAY_FAULTS: Final = frozenset({FaultKind.NTP_SLEW})
+FIELD_DAY_FAULTS: Final = frozenset({FaultKind.NTP_SLEW, *SETUP_MISTAKES, FaultKind.SECOND_MASTER})
 """Kinds that are injected by name only: what they violate is bounded, or they need a mission of their own."""
 
 

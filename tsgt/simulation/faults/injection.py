@@ -12,6 +12,7 @@ import numpy as np
 
 from tsgt.simulation.faults.catalogue import RELOCK_DELAY_S, FaultKind
 from tsgt.simulation.faults.computers import COMPUTER_INJECTORS
+from tsgt.simulation.faults.setup_mistakes import MISTAKE_INJECTORS
 from tsgt.simulation.instrument import LineFault, Lock
 from tsgt.simulation.kernel import DriftingClock
 from tsgt.simulation.lora.adversary import MAX_NOISE_BYTES, ReplayAttacker
@@ -341,4 +342,5 @@ _INJECTORS: Final[Mapping[FaultKind, Callable[[Mission, Fault, np.random.Generat
     FaultKind.SLOW_READER: _slow_reader,
     FaultKind.VANISHING_READER: _vanishing_reader,
     **COMPUTER_INJECTORS,
+    **MISTAKE_INJECTORS,
 }

@@ -15,6 +15,7 @@ from tsgt.simulation.mission.run_log import (
     StationLog,
     ValidPoses,
 )
+from tsgt.simulation.mission.setup_mistakes import SetupMistake
 from tsgt.simulation.mission.stream_listener import listen_to_stream
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "MasterLog",
     "Mission",
     "MissionResult",
+    "SetupMistake",
     "Slew",
     "StationLog",
     "ValidPoses",

@@ -52,15 +52,15 @@ class Computer:
         self._settings = settings
         self._jitter = jitter
 
-    def radio(self, *, slow: bool = True) -> RadioOpener:
-        """Return the opener of the radio; ``slow``: with the delays of a real host."""
+    def radio(self, settings: LoRaSettings | None = None, *, slow: bool = True) -> RadioOpener:
+        """Return the opener of the radio; ``settings``: other than the mission's; ``slow``: with the delays of a real host."""
         delay = HostDelay() if slow else None
         return radio_opener(
             self._air,
             self.name,
             self.clock,
             self.rng,
-            self._settings,
+            settings or self._settings,
             delay,
             self._jitter,
             on_open=self._opened,

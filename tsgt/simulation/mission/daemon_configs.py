@@ -112,10 +112,15 @@ def _odometry_config(scenario: ScenarioConfig) -> OdometryConfig | None:
 
 
 def client_config(
-    scenario: ScenarioConfig, entry: SimulatedStation, options: SimulationOptions, folder: Path
+    scenario: ScenarioConfig,
+    entry: SimulatedStation,
+    options: SimulationOptions,
+    folder: Path,
+    *,
+    classic: bool = False,
 ) -> ClientConfig:
-    """Return a client's configuration; journal and socket are in ``folder``."""
-    classic = isinstance(options.protocol, ClassicMasterConfig)
+    """Return a client's configuration; journal and socket are in ``folder``. ``classic``: whatever the mission's protocol is."""
+    classic = classic or isinstance(options.protocol, ClassicMasterConfig)
     return ClientConfig(
         kind="client",
         station=entry.station,
@@ -128,10 +133,12 @@ def client_config(
     )
 
 
-def instrument_config(entry: SimulatedStation, port: Path) -> LeicaInstrumentConfig:
+def instrument_config(
+    entry: SimulatedStation, port: Path, *, prism_constant_mm: float = 0.0
+) -> LeicaInstrumentConfig:
     """Return the instrument configuration of a client, matching the simulated instrument.
 
-    The instrument adds no prism constant; the master does.
+    The instrument adds no prism constant, unless one is given by mistake; the master does.
     """
     model = entry.instrument
     return LeicaInstrumentConfig(
@@ -139,7 +146,7 @@ def instrument_config(entry: SimulatedStation, port: Path) -> LeicaInstrumentCon
         port=port,
         baud=cast("Baud", model.baud),
         prism_type="user",
-        prism_constant_mm=0.0,
+        prism_constant_mm=prism_constant_mm,
         latency_ms=model.processing_min_ms,
         angle_delay_ms=model.angle_delay_ms,
     )

@@ -36,6 +36,7 @@ from tsgt.simulation.mission.daemon_configs import (
 )
 from tsgt.simulation.mission.poll_replies import observed
 from tsgt.simulation.mission.run_log import START_UNIX_NS, MasterLog, ObservedInstrument, StationLog
+from tsgt.simulation.mission.setup_mistakes import NO_MISTAKE, SetupMistake
 from tsgt.simulation.wheel_odometry import OdometryModel, OdometryProgram, simulate_odometry
 from tsgt.simulation.world import is_shaken, scenario_world
 from tsgt.station import ClientDependencies, ClientStatus, run_client
@@ -171,7 +172,9 @@ class Mission:
         self.lines = {number: self._line(number) for number in numbers}
         self._boots = dict.fromkeys(numbers, 1)
         self.master_logs: list[MasterLog] = []  # one per start of the master
+        self.other_master_logs: list[MasterLog] = []  # of masters that do not belong to the mission
         self.prisms = {s.station: s.prism for s in scenario.stations}
+        self.mistakes: dict[int, SetupMistake] = {}  # in force from the next start of the client on
         self.drifting: set[int] = set()  # stations whose clock drift is changing
         self.superframe = isinstance(options.protocol, SuperframeMasterConfig)
         self.station_logs = {
@@ -262,41 +265,58 @@ class Mission:
 
     def start_master(self) -> None:
         """Start the master with a new recording."""
-        folder = self._folder / f"master{len(self.master_logs)}"
-        unix_at_zero_ns = self.clock.realtime_ns() - self.clock.monotonic_ns()
-        master_log = MasterLog(folder, self._true.monotonic_ns, unix_at_zero_ns)
+        master_log = self._new_master_log(f"master{len(self.master_logs)}", self.clock)
         self.master_logs.append(master_log)
+        self.computers[MASTER].start(self._master(master_log, self.computers[MASTER], self.clock))
+
+    async def run_second_master(self, for_s: float) -> None:
+        """Run another master with the same key, stations and set-up beside the robot's, and then stop it."""
+        name = f"other master{len(self.other_master_logs)}"
+        clock = VirtualClock(START_UNIX_NS)
+        computer = Computer(name, clock, self.air, self._settings, self._interferer_rng.spawn(1)[0], None)
+        self._positions_m[name] = _INTERFERER_POSITION_M
+        master_log = self._new_master_log(name.replace(" ", "-"), clock)
+        self.other_master_logs.append(master_log)
+        computer.start(self._master(master_log, computer, clock))
+        await asyncio.sleep(for_s)
+        await computer.stop()
+
+    def _new_master_log(self, folder: str, clock: VirtualClock) -> MasterLog:
+        unix_at_zero_ns = clock.realtime_ns() - clock.monotonic_ns()
+        return MasterLog(self._folder / folder, self._true.monotonic_ns, unix_at_zero_ns)
+
+    def _master(
+        self, master_log: MasterLog, computer: Computer, clock: VirtualClock
+    ) -> Coroutine[None, None, None]:
+        folder = master_log.folder
         config = master_config(self._scenario, self._options, folder)
         start_imu = None
         if self.imu is not None:
-            start_imu = ImuProgram(IMU_MODELS[self._scenario.imu.model], self.imu.samples, self.clock).start
+            start_imu = ImuProgram(IMU_MODELS[self._scenario.imu.model], self.imu.samples, clock).start
         start_odometry = None
         if self.odometry is not None:
-            start_odometry = OdometryProgram(self.odometry, self.clock).start
+            start_odometry = OdometryProgram(self.odometry, clock).start
         folder.mkdir()
-        computer = self.computers[MASTER]
         writer = computer.new_writer()
         open_radio = computer.radio()
         if not self.superframe:
             open_radio = observed(open_radio, master_log.poll_replies.append)
-        computer.start(
-            run_master(
-                config,
-                self.parameters,
-                self._settings,
-                MasterDependencies(
-                    open_radio=open_radio,
-                    clock=self.clock,
-                    key=self._key,
-                    random_bits=self._random_bits,
-                    observe=master_log.observe,
-                    start_imu=start_imu,
-                    start_odometry=start_odometry,
-                    write=writer.write,
-                    sync=writer.sync,
-                    disk_status=lambda _folder: computer.disk.status(),
-                    start_check=start_now,  # no other thread: it would break on a look at all objects
-                ),
+        return run_master(
+            config,
+            self.parameters,
+            self._settings,
+            MasterDependencies(
+                open_radio=open_radio,
+                clock=clock,
+                key=self._key,
+                random_bits=self._random_bits,
+                observe=master_log.observe,
+                start_imu=start_imu,
+                start_odometry=start_odometry,
+                write=writer.write,
+                sync=writer.sync,
+                disk_status=lambda _folder: computer.disk.status(),
+                start_check=start_now,  # no other thread: it would break on a look at all objects
             ),
         )
 
@@ -323,10 +343,13 @@ class Mission:
         return int.from_bytes(self._bits_rng.bytes(-(-count // 8))) >> -count % 8
 
     def _client(self, entry: SimulatedStation) -> Coroutine[None, None, None]:
-        station = entry.station
+        station, mistake = entry.station, self.mistakes.get(entry.station, NO_MISTAKE)
         station_log, computer = self.station_logs[station], self._computer(station)
         clock = _ClientClock(computer)
         folder = self._folder / station_name(station)
+        if not mistake.delivers:  # what it measures is of no station of the mission
+            folder, station_log = folder / "mistake", StationLog(station, None)
+            entry = entry.model_copy(update={"station": mistake.station or station})
         folder.mkdir(exist_ok=True)
 
         def on_reading(reading: Reading) -> None:
@@ -336,14 +359,17 @@ class Mission:
             station_log.true_times_ns[host_time_ns] = clock.true_ns(reading.at_ns)
             station_log.read_times_ns[host_time_ns] = self._true.monotonic_ns()
 
+        settings = mistake.applied_to(self._settings)
         return run_client(
-            client_config(self._scenario, entry, self._options, folder),
-            self._settings,
+            client_config(self._scenario, entry, self._options, folder, classic=mistake.classic),
+            settings,
             ClientDependencies(
-                instrument=self._driver(entry, on_reading),
-                open_radio=computer.radio(),
+                instrument=self._driver(
+                    self._entry(station), on_reading, prism_constant_mm=mistake.prism_constant_mm
+                ),
+                open_radio=computer.radio(settings),
                 clock=clock,
-                key=self._key,
+                key=self._key if mistake.key is None else mistake.key,
                 random_bits=self._random_bits,
                 boot=f"{station_name(station)}-{self._boots[station]}",
                 suspended_ns=lambda: computer.suspended_ns,
@@ -351,8 +377,15 @@ class Mission:
             ),
         )
 
-    def _driver(self, entry: SimulatedStation, on_reading: Callable[[Reading], None]) -> ObservedInstrument:
-        config = instrument_config(entry, self._folder / station_name(entry.station))
+    def _driver(
+        self,
+        entry: SimulatedStation,
+        on_reading: Callable[[Reading], None],
+        *,
+        prism_constant_mm: float = 0.0,
+    ) -> ObservedInstrument:
+        folder = self._folder / station_name(entry.station)
+        config = instrument_config(entry, folder, prism_constant_mm=prism_constant_mm)
         line, clock = self.lines[entry.station], self._computer(entry.station).clock
         return ObservedInstrument(config, line.open, clock, on_reading)
 
@@ -407,6 +440,16 @@ class Mission:
         line.faults.drop_responses = False
         self._record_crash_window(computer)
         resume()
+
+    async def make_mistake(self, station: int, mistake: SetupMistake, for_s: float) -> None:
+        """Restart a station's client with a mistake in its set-up, and after some time with the right one."""
+        if station in self.mistakes or self._computer(station).is_down:
+            return
+        self.mistakes[station] = mistake
+        await self.restart(station, self.now_s)
+        await asyncio.sleep(for_s)
+        del self.mistakes[station]
+        await self.restart(station, self.now_s)
 
     async def _record_status(self, name: str) -> None:
         """Record a client's status before it ends; the authors' node has none."""

@@ -114,7 +114,7 @@ class MasterLog:
     """
 
     def __init__(self, folder: Path, now_ns: Callable[[], int], unix_at_zero_ns: int) -> None:
-        self._folder = folder
+        self.folder = folder
         self._now_ns = now_ns
         self.unix_at_zero_ns = unix_at_zero_ns
         self.crashed = False  # whether it was killed
@@ -232,7 +232,7 @@ class MasterLog:
 
     def recording(self) -> Path | None:
         """Return the recording; None: the master ended before it had one."""
-        return next(iter(sorted(self._folder.glob("*.jsonl"))), None)
+        return next(iter(sorted(self.folder.glob("*.jsonl"))), None)
 
 
 @dataclass(slots=True)

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 REPLY_LEAD_NS = 6_000_000
 """A reply is composed this long before its slot: the radio needs 3 ms, a Raspberry Pi the rest."""
 
+NO_SLOT_TIMEOUT_NS = 30_000_000_000
+"""A station that the master has not received lately has a slot in each fourth frame only, of at most 3 s with 16 stations."""
+
 ACKNOWLEDGED_INTERVAL_NS = 5_000_000_000
 """Interval of the journal's records of the cumulative acknowledgement."""
 
@@ -89,6 +92,7 @@ class SuperframeLink:
         self._write_acknowledged()
         if not self._authenticator.authentic:
             log.warning("unauthenticated", key_file=None)
+        self._slot_ns: int | None = None  # first beacon without a slot since the last one with it
         self._log_limiter = LogLimiter()
         self._traffic_monitor = UnknownTrafficMonitor(clock)
 
@@ -133,7 +137,17 @@ class SuperframeLink:
                 self._record(beacon)
                 self._submit_next()
                 if beacon.slot_ns is not None:
+                    self._slot_ns = None
                     await self._reply(radio, beacon.slot_ns)
+                else:
+                    self._no_slot(packet.received_at_ns)
+
+    def _no_slot(self, now_ns: int) -> None:
+        """Warn if beacons have been without a slot for this station for long."""
+        if self._slot_ns is None:
+            self._slot_ns = now_ns
+        elif now_ns - self._slot_ns > NO_SLOT_TIMEOUT_NS and self._may_log("no_slot"):
+            log.warning("no_slot", for_s=round((now_ns - self._slot_ns) / 1e9))
 
     async def _reply(self, radio: Radio, slot_ns: int) -> None:
         missed_slots = self._station.missed_slots

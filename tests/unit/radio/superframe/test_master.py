@@ -57,6 +57,17 @@ def sessions(frames: ScriptedFrames, count: int, silent: tuple[int, ...] = ()) -
     return found
 
 
+def test_beacon_of_another_master_is_counted(frames: ScriptedFrames) -> None:
+    """One with session info and the right key; not the own ones, a forged one, or noise."""
+    other = scripted_frames()
+    other.master.session = 7
+    other.begin()
+    own = frames.payload
+    for payload in (other.payload, other.payload[:-1] + b"x", own, b"noise"):
+        assert frames.master.received(payload, frames.now_ns + MS, 0) is None
+    assert frames.master.other_beacons == 1
+
+
 # --- Beacons --------------------------------------------------------------------------------------------------------
 
 

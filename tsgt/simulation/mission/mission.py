@@ -409,9 +409,12 @@ class Mission:
         await self.computers[name].stop()
 
     async def crash(self, name: str, *, down_s: float) -> None:
-        """Kill a daemon as ``kill -9`` does, and restart it after ``down_s``; no effect on one that is down."""
+        """Kill a daemon as ``kill -9`` does, and restart it after ``down_s``.
+
+        No effect on one that is down, or whose computer is suspended.
+        """
         computer = self.computers[name]
-        if computer.is_down:
+        if computer.is_down or computer.is_suspended:
             return
         computer.is_down = True
         if name == MASTER:
@@ -477,10 +480,13 @@ class Mission:
         return next(number for number in self.station_logs if station_name(number) == name)
 
     async def reboot(self, station: int, at_s: float, off_s: float) -> None:
-        """Power a station's computer off and on: CLOCK_MONOTONIC restarts at zero, the Unix clock continues where it stopped."""
+        """Power a station's computer off and on: CLOCK_MONOTONIC restarts at zero, the Unix clock continues where it stopped.
+
+        No effect on one that is down or suspended.
+        """
         await self.sleep_until(at_s)
         computer = self._computer(station)
-        if computer.is_down:
+        if computer.is_down or computer.is_suspended:
             return
         computer.is_down = True
         await self.stop(computer.name)

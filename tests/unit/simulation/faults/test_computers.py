@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
@@ -62,3 +63,19 @@ def test_measurements_wait_for_a_stalled_disk(tmp_path: Path) -> None:
     result = run_mission(tmp_path, _linear(), script=stall, protocol=SUPERFRAME, duration_s=24.0)
     assert check_invariants(result) == []
     assert min(queued) >= 12
+
+
+@pytest.mark.slow
+def test_suspended_computer_is_neither_rebooted_nor_killed(tmp_path: Path) -> None:
+    """Its programs end only after it has been resumed: the mission would wait for them with the time at a stop."""
+
+    async def suspend(mission: Mission) -> None:
+        await mission.sleep_until(4.0)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(mission.suspend(2, 4.0))
+            group.create_task(mission.reboot(2, 5.0, 1.0))
+            await mission.sleep_until(6.0)
+            await mission.crash("station2", down_s=1.0)
+
+    result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=10.0)
+    assert len(result.station_logs[2].journals) == 1

@@ -82,11 +82,9 @@ fuzz: $(VENV)/.test
 soak: $(VENV)/.test
 	$(BIN)/python benchmarks/run.py soak --minutes 15
 
-BENCHMARKS := alignment process air simulation_speed clock_scenarios beacon_clock instrument_time instrument nees continuous
-
-# Speed and memory, as ratios within one run; `python benchmarks/run.py` lists all benchmarks.
+# Speed and memory of the quick benchmarks, written to docs/reference/benchmarks.md; `python benchmarks/run.py` lists all.
 bench: $(VENV)/.test
-	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/run.py $$name || exit 1; done
+	$(BIN)/python benchmarks/run.py table
 
 # Schemas, field tables and the command reference are generated from the code; a test fails when they are stale.
 generated: $(VENV)/.test

@@ -108,7 +108,9 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
         found += (Violation("pose", what) for what in scale_failures(master_log, result))
         found += (Violation("pose", what) for what in twist_failures(master_log, result))
         found += (Violation("pose", what) for what in rule_failures(master_log, result.parameters))
-        found += (Violation("event", what) for what in event_failures(master_log))
+        found += (
+            Violation("event", what) for what in event_failures(master_log, superframe=result.superframe)
+        )
         found += duplicate_deliveries(master_log)
         found += timestamp_violations(
             master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)

@@ -15,18 +15,21 @@ if TYPE_CHECKING:
 LOST_S = 20.0
 """A station that has not been heard for longer must have been reported as lost: that takes 5 s, while it is polled or has slots."""
 
+CLASSIC_LOST_S = 80.0
+"""The same over ``classic``, which polls nobody while it synchronises three stations, for up to a minute."""
+
 HEARD_S = 0.5
 """A station that was heard less than this ago must have been reported as recovered."""
 
 
-def event_failures(master_log: MasterLog) -> Iterator[str]:
+def event_failures(master_log: MasterLog, *, superframe: bool) -> Iterator[str]:
     """Yield the stations of which events are missing, or were not called for."""
     events = Counter((event.station, event.event) for event in master_log.events)
     for station, changes in _status_changes(master_log).items():
         count = events[station, "instrument_status"]
         if count != changes:
             yield f"station {station}: {count} events of its instrument's status, which has changed {changes} times"
-    yield from _wrongly_lost(master_log)
+    yield from _wrongly_lost(master_log, LOST_S if superframe else CLASSIC_LOST_S)
 
 
 def _status_changes(master_log: MasterLog) -> Counter[int]:
@@ -47,7 +50,7 @@ def _status_changes(master_log: MasterLog) -> Counter[int]:
     return changes
 
 
-def _wrongly_lost(master_log: MasterLog) -> Iterator[str]:
+def _wrongly_lost(master_log: MasterLog, lost_s: float) -> Iterator[str]:
     changes = [event for event in master_log.events if event.event in ("station_lost", "station_recovered")]
     lost: dict[int | None, bool] = {}
     reported: set[int] = set()
@@ -61,7 +64,7 @@ def _wrongly_lost(master_log: MasterLog) -> Iterator[str]:
             if heard_s is None or station.id in reported:
                 continue
             is_lost = lost.get(station.id, False)
-            if (heard_s > LOST_S and not is_lost) or (heard_s < HEARD_S and is_lost):
+            if (heard_s > lost_s and not is_lost) or (heard_s < HEARD_S and is_lost):
                 reported.add(station.id)
                 yield (
                     f"station {station.id}: last heard {heard_s:.1f} s before the status at "

@@ -227,7 +227,7 @@ def test_events_of_an_instruments_status(
         *(replace(measurement(number), status=status) for number, status in enumerate(statuses)),
         *(replace(EVENT, event="instrument_status", station=1) for _ in range(events)),
     )
-    assert len(list(event_failures(log))) == count
+    assert len(list(event_failures(log, superframe=True))) == count
 
 
 @pytest.mark.parametrize(
@@ -247,7 +247,7 @@ def test_events_of_lost_stations(tmp_path: Path, heard_s: float, events: tuple[s
         *(replace(EVENT, event=event, station=1, stamp_ns=START) for event in events),
         _status(last_heard_s=heard_s),
     )
-    assert len(list(event_failures(log))) == count
+    assert len(list(event_failures(log, superframe=True))) == count
 
 
 @pytest.mark.parametrize(("age_s", "count"), [(0.05, 0), (0.0, 1), (0.45, 1), (None, 1)])
@@ -335,3 +335,9 @@ def test_acknowledgement_that_was_not_journalled(tmp_path: Path, oldest: int | N
     result: Any = SimpleNamespace(superframe=True, master_logs=[log], duration_s=60.0)
     index: Any = SimpleNamespace(oldest_queued=lambda: oldest)
     assert len(list(missing_acknowledgements(result, {1: index}))) == count
+
+
+def test_stations_that_classic_does_not_poll_while_it_synchronises_are_not_lost(tmp_path: Path) -> None:
+    """Three stations take almost a minute."""
+    log = _log(tmp_path, _status(last_heard_s=45.0))
+    assert not list(event_failures(log, superframe=False))

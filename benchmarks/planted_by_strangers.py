@@ -28,13 +28,13 @@ async def full_disk(mission: Mission) -> None:
 # What a user would see comes after the colon.
 DEFECTS = {
     # Client
-    "numbers": Defect(
+    "numbers-again": Defect(
         "a restarted client numbers from 0 again: two measurements with one number, one of them lost",
         d.number_from_zero_again,
         (F.CLIENT_CRASH,),
         duration_s=100,
     ),
-    "acknowledged": Defect(
+    "acknowledged-ahead": Defect(
         "a journal's acknowledgement is five ahead: a restarted client never delivers those",
         d.journal_too_many_acknowledged,
         (F.CLIENT_CRASH, F.LOSS),
@@ -56,6 +56,7 @@ DEFECTS = {
         "classic sends times in whole 10 ms: poses of a moving robot are up to 15 mm off",
         d.truncate_times,
         protocol="classic",
+        duration_s=30,
     ),
     "direction": Defect(
         "directions to search in are in the frame of station 1: other stations search where no robot is",
@@ -66,6 +67,7 @@ DEFECTS = {
     "battery": Defect(
         "a battery is shown with 30 points more than it has: the instrument dies unannounced",
         d.report_full_batteries,
+        duration_s=30,
     ),
     # Status and events of the master
     "outstanding": Defect(
@@ -73,10 +75,11 @@ DEFECTS = {
         d.change_station_status(d.hide_outstanding),
         script=silent_station,
     ),
-    "offset": Defect(
+    "offset-neighbour": Defect(
         "the status shows each station the clock offset of the next one",
         d.show_neighbours_offset,
         protocol="classic",
+        duration_s=30,
     ),
     "drain": Defect(
         "the drain rate has the wrong sign: a growing backlog seems to end in a minute",
@@ -87,6 +90,7 @@ DEFECTS = {
     "bound": Defect(
         "the bound of the newest stamp is a thousandth of what it is",
         d.change_station_status(d.bound_in_microseconds),
+        duration_s=30,
     ),
     "lost-name": Defect(
         "the event of a lost station names the next one: the operator walks to the wrong tripod",
@@ -104,17 +108,21 @@ DEFECTS = {
         script=full_disk,
     ),
     # Estimation
-    "w-first": Defect("quaternions are w, x, y, z", d.change_batch(d.put_w_first)),
-    "blocks": Defect("the covariance has rotation before position", d.change_batch(d.swap_covariance_blocks)),
+    "w-first": Defect("quaternions are w, x, y, z", d.change_batch(d.put_w_first), duration_s=30),
+    "blocks": Defect(
+        "the covariance has rotation before position", d.change_batch(d.swap_covariance_blocks), duration_s=30
+    ),
     "axes": Defect(
         "the covariance is about the robot's axes: a filter weighs roll and pitch in each other's place",
         d.change_batch(d.covariance_about_robot_axes),
+        duration_s=30,
     ),
     "angular-velocity": Defect(
         "the angular velocity is in the frame of the poses: roll rate and pitch rate are mixed",
         d.change_batch(d.angular_velocity_in_world),
+        duration_s=30,
     ),
-    "constant": Defect("the prism constant is added twice: 10 mm", d.add_constant_twice),
+    "constant-twice": Defect("the prism constant is added twice: 10 mm", d.add_constant_twice, duration_s=30),
     "outage": Defect(
         "poses are valid over outages of up to 20 s: decimetres off, and a robot drives by them",
         d.interpolate_over_outages,
@@ -133,7 +141,9 @@ DEFECTS = {
         estimator="continuous",
         duration_s=100,
     ),
-    "shares": Defect("poses name the wrong station of each prism", d.change_batch(d.name_other_stations)),
+    "shares": Defect(
+        "poses name the wrong station of each prism", d.change_batch(d.name_other_stations), duration_s=30
+    ),
     # IMU
     "jump": Defect(
         "`jump_m` and `jump_rad` are always 0: a controller takes each correction for motion",
@@ -155,15 +165,19 @@ DEFECTS = {
     ),
     # Recording and stream
     "status-lines": Defect(
-        "the recording has no statuses: nobody finds out later what went wrong", d.record_no_status
+        "the recording has no statuses: nobody finds out later what went wrong",
+        d.record_no_status,
+        duration_s=30,
     ),
     "beacons": Defect(
         "beacons are recorded with the number of the next: a journal is merged a frame late",
         d.record_next_beacon,
+        duration_s=30,
     ),
     "frames": Defect(
         "`setup` has the stations' rotations inverted: sight lines and maps are wrong",
         d.invert_frames_in_setup,
+        duration_s=30,
     ),
     "late-setup": Defect(
         "a reader that connects later gets no `setup`: it knows neither frames nor limits",

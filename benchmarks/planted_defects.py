@@ -8,7 +8,7 @@ missions with the faults that make it show, one seed after the other, until a ch
 nobody in the simulation is clever enough to make use of it, a test is run with the defect instead. Ends with 3 when one is
 not found.
 
-`--from` takes the defects from another file, a Python module with a dictionary ``DEFECTS`` like the one below;
+Those in `planted_by_strangers.py` run as well. `--from` takes the defects from another file, a Python module with a dictionary ``DEFECTS`` like the one below;
 docs/explanation/faults.md has an example.
 """
 
@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import Mission
 
 TESTS = Path(__file__).parents[1] / "tests"
+
+STRANGERS = Path(__file__).with_name("planted_by_strangers.py")
 
 SEEDS = 8
 """Missions per defect at most."""
@@ -365,7 +367,7 @@ def main() -> int:
     )
     parser.add_argument("-v", "--verbose", action="store_true", help="also the first violation of each")
     arguments = parser.parse_args()
-    known = DEFECTS if arguments.file is None else read_defects(arguments.file)
+    known = DEFECTS | read_defects(STRANGERS) if arguments.file is None else read_defects(arguments.file)
     if unknown := set(arguments.names) - set(known):
         parser.error(f"no defect {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     configure_logging("critical")

@@ -22,6 +22,8 @@ async def full_disk(mission: Mission) -> None:
     """Let the master's disk take nothing for ten seconds."""
     await mission.sleep_until(20.0)
     mission.computers[MASTER].disk.fail_writes(errno.ENOSPC, 20 * 10**9, 30 * 10**9)
+    await mission.sleep_until(30.0)
+    mission.computers[MASTER].disk.write_error = None
     await mission.sleep_until(45.0)
 
 
@@ -48,8 +50,7 @@ DEFECTS = {
     "journal-ok": Defect(
         "`tsgt status` of a station shows a good journal on a full disk: nothing is journalled, nobody knows",
         d.change_client_status(journal_ok=True, journal_waiting=0),
-        (F.DISK_FULL,),
-        duration_s=180,
+        test="unit/station/test_daemon.py::test_full_disk_stops_neither_instrument_nor_radio",
     ),
     # Radio
     "times": Defect(
@@ -61,8 +62,7 @@ DEFECTS = {
     "direction": Defect(
         "directions to search in are in the frame of station 1: other stations search where no robot is",
         d.direct_in_wrong_frame,
-        (F.PRISM_LOSS,),
-        duration_s=180,
+        test="unit/master/test_reacquisition_hints.py::test_prism_is_within_the_spread_in_the_reference_scenario",
     ),
     "battery": Defect(
         "a battery is shown with 30 points more than it has: the instrument dies unannounced",

@@ -337,10 +337,17 @@ def read_defects(path: Path) -> dict[str, Defect]:
     return found
 
 
-def fails(key: str) -> bool:
+def all_defects() -> dict[str, Defect]:
+    """Return the defects of this file and those of strangers."""
+    return DEFECTS | read_defects(STRANGERS)
+
+
+def fails(key: str, test: str) -> bool:
     """Whether a defect's test passes without it and fails with it, each time in a process of its own."""
-    planted = f"import planted_defects as p; p.DEFECTS[{key!r}].plant(p.Planting())"
-    run = f"import sys, pytest; sys.exit(pytest.main(['-q', '-p', 'no:cacheprovider', {str(TESTS / DEFECTS[key].test)!r}]))"
+    planted = f"import planted_defects as p; p.all_defects()[{key!r}].plant(p.Planting())"
+    run = (
+        f"import sys, pytest; sys.exit(pytest.main(['-q', '-p', 'no:cacheprovider', {str(TESTS / test)!r}]))"
+    )
     path = os.pathsep.join([str(Path(__file__).parent), str(TESTS), os.environ.get("PYTHONPATH", "")])
     ends = [
         subprocess.run(
@@ -367,7 +374,7 @@ def main() -> int:
     )
     parser.add_argument("-v", "--verbose", action="store_true", help="also the first violation of each")
     arguments = parser.parse_args()
-    known = DEFECTS | read_defects(STRANGERS) if arguments.file is None else read_defects(arguments.file)
+    known = all_defects() if arguments.file is None else read_defects(arguments.file)
     if unknown := set(arguments.names) - set(known):
         parser.error(f"no defect {', '.join(sorted(unknown))}; there are {', '.join(known)}")
     configure_logging("critical")
@@ -377,7 +384,7 @@ def main() -> int:
     for key in arguments.names or known:
         defect = known[key]
         if defect.test:
-            seen = f"`{defect.test}`" if fails(key) else ""
+            seen = f"`{defect.test}`" if fails(key, defect.test) else ""
             print(f"| {defect.name} | | | {seen or '**nothing**'} | |", flush=True)
         else:
             found = hunt(defect, arguments.seeds)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry import log_so3, rotation_from_quaternion
+from tsgt.estimation import centroid_at_point
+from tsgt.geometry import log_so3, rotate, rotation_from_quaternion, skew
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
@@ -66,6 +67,10 @@ def scale_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str
                 poses.covariance[:, 3:, 3:],
             ),
         }
+        # The prisms' centroid is known better than the reference point: only with the right blocks, about the right axes, do
+        # position and rotation errors cancel there.
+        arm_m = rotate(rotation, centroid_at_point(result.parameters))
+        errors["centroid"] = _at_arm(errors["position"][0], errors["rotation"][0], arm_m, poses.covariance)
         for name, (error, covariance) in errors.items():
             squares = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
             mean, sigma = mean_of_correlated(at_s, squares)
@@ -74,6 +79,17 @@ def scale_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str
                     f"{len(at_s)} {series} poses: the mean squared error of the {name} in sigmas is {mean:.2f}, standard error "
                     f"{sigma:.2f}, minimum {limit:g} of 3: its covariance is too large"
                 )
+
+
+def _at_arm(
+    position: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    arm_m: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return errors, (N, 3), and covariance, (N, 3, 3), of the position at the end of lever arms."""
+    to_arm = np.concatenate([np.broadcast_to(np.eye(3), (len(arm_m), 3, 3)), -skew(arm_m)], axis=2)
+    return position + np.cross(rotation, arm_m), to_arm @ covariance @ to_arm.swapaxes(1, 2)
 
 
 def mean_of_correlated(at_s: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[float, float]:

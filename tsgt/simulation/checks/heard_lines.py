@@ -21,7 +21,7 @@ def heard_failures(master_log: MasterLog) -> Iterator[str]:
         places.setdefault(line, []).append(place)
     for number, heard in enumerate(master_log.heard, 1):
         lines = heard[_GREETING_LINES:]
-        if len(heard) >= _GREETING_LINES and heard[1] not in places:
+        if len(heard) >= _GREETING_LINES and heard[1] not in master_log.setup_hashes:
             yield f"connection {number}: the second line is no set-up that was published"
         if not lines or any(published[at : at + len(lines)] == lines for at in places.get(lines[0], ())):
             continue

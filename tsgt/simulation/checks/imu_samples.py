@@ -28,6 +28,14 @@ MIN_RECORDED_SHARE = 0.98
 LAST_LINE_S = 0.2
 """The last line of the program may be incomplete at the end."""
 
+MIN_JUMPS, MIN_STATUSES = 20, 10
+
+MAX_DIFFERENT_SHARE = 0.2
+"""Share of the statuses that may state another use of the IMU than the newest pose: it changes between two poses."""
+
+MAX_BIAS_ERROR_RADPS = 0.01
+"""Limit of the median error of the gyro's stated bias."""
+
 _DECIMALS = 9
 
 
@@ -42,6 +50,31 @@ def imu_failures(result: MissionResult) -> Iterator[str]:
             yield from _recording_failures(master_log, path, samples, rows, result.imu.truth.latency_s)
     if result.faults_end_s is not None:
         yield from _missing(result, rows)
+
+
+def imu_status_failures(result: MissionResult) -> Iterator[str]:
+    """Yield what is wrong with what poses and status say of the use of the IMU, its jumps and its bias."""
+    if result.imu is None:
+        return
+    for master_log in result.master_logs:
+        if len(master_log.jumps_m) >= MIN_JUMPS and not any(master_log.jumps_m):
+            yield f"none of {len(master_log.jumps_m)} jumps of predicted poses is above 0"
+        statuses = [status.imu for status in master_log.statuses]
+        pairs = [
+            (status.use, use)
+            for status, use in zip(statuses, master_log.imu_uses_at_status, strict=True)
+            if status is not None and use is not None
+        ]
+        different = sum(use != of_pose for use, of_pose in pairs)
+        if len(pairs) >= MIN_STATUSES and different > MAX_DIFFERENT_SHARE * len(pairs):
+            yield f"{different} of {len(pairs)} statuses state another use of the IMU than the pose before"
+        errors = [
+            float(np.linalg.norm(np.array(status.gyro_bias_radps) - result.imu.truth.gyro_bias_radps[-1]))
+            for status in statuses
+            if status is not None and status.gyro_bias_radps is not None
+        ]
+        if len(errors) >= MIN_STATUSES and (median := float(np.median(errors))) > MAX_BIAS_ERROR_RADPS:
+            yield f"gyro bias by {len(errors)} statuses: median error {median:.4f} rad/s, limit {MAX_BIAS_ERROR_RADPS:g}"
 
 
 def _keys(samples: DeviceSamples) -> Iterator[tuple[int, tuple[float, ...]]]:

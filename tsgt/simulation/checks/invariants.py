@@ -20,7 +20,7 @@ from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.covariance_scale import scale_failures
 from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.heard_lines import heard_failures
-from tsgt.simulation.checks.imu_samples import imu_failures
+from tsgt.simulation.checks.imu_samples import imu_failures, imu_status_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.odometry_samples import odometry_failures
 from tsgt.simulation.checks.outstanding import outstanding_failures
@@ -31,7 +31,9 @@ from tsgt.simulation.checks.pose_lateness import lateness_failures
 from tsgt.simulation.checks.pose_rules import rule_failures
 from tsgt.simulation.checks.pose_twists import twist_failures
 from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
+from tsgt.simulation.checks.setup_lines import beacon_failures, setup_failures
 from tsgt.simulation.checks.station_events import event_failures
+from tsgt.simulation.checks.station_reports import report_failures
 from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.faults import NTP_SLEW_PPM
 from tsgt.simulation.mission import JournalIndex
@@ -97,10 +99,13 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
     found += (Violation("liveness", what) for what in missing_acknowledgements(result, indices))
     found += (Violation("liveness", what) for what in missing_poses(result))
     found += (Violation("status", what) for what in outstanding_failures(result))
+    found += (Violation("status", what) for what in report_failures(result))
     for master_log in result.master_logs:
         found += (Violation("recording", what) for what in recording_failures(master_log))
         found += (Violation("status", what) for what in size_failures(master_log))
         found += (Violation("stream", what) for what in heard_failures(master_log))
+        found += (Violation("setup", what) for what in setup_failures(master_log, result))
+        found += (Violation("recording", what) for what in beacon_failures(master_log, indices))
         found += (Violation("status", what) for what in status_failures(master_log, indices))
         found += (Violation("lost", what) for what in unpublished_replies(master_log))
         found += (Violation("pose", what) for what in age_failures(master_log, result.parameters))
@@ -119,6 +124,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
         if replay:
             found += replay_mismatches(master_log)
     found += (Violation("imu", what) for what in imu_failures(result))
+    found += (Violation("imu", what) for what in imu_status_failures(result))
     found += (Violation("odometry", what) for what in odometry_failures(result))
     found += (Violation("liveness", what) for what in liveness_failures(result, indices))
     found += (Violation("memory", what) for what in result.oversized_collections)

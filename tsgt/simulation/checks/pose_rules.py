@@ -42,6 +42,10 @@ def rule_failures(master_log: MasterLog, parameters: Parameters) -> Iterator[str
         if len(wrong):
             at_s = (stamps_ns[wrong[0]] - master_log.unix_at_zero_ns) / 1e9
             yield f"{series} poses: the epoch after {at_s:.3f} s is not the next one ({len(wrong)} times)"
+    known = {(station.station, station.prism) for station in parameters.stations}
+    known.update((measurement.station, measurement.prism) for measurement in master_log.measurements)
+    for station, prism in sorted(master_log.trackers - known):
+        yield f"poses name station {station} for prism {prism}, which it has never tracked"
     valid = master_log.valid_poses()
     for series in np.unique(valid.series).tolist():
         poses = valid.select(valid.series == series)

@@ -18,6 +18,7 @@ from tsgt.recording import (
     ClockRecord,
     EventRecord,
     PoseRecord,
+    SetupRecord,
     StatusRecord,
     decode_line,
     read_lines,
@@ -105,7 +106,7 @@ class MasterLog:
 
     Attributes
     ----------
-    measurements, clocks, statuses, events
+    measurements, clocks, statuses, setups, events
         Published records.
     counts_at_status
         What had been published by each status: before the poses that directly precede it, and with them.
@@ -123,6 +124,13 @@ class MasterLog:
         self.arrived_ns: list[int] = []  # True time of each measurement's publication, in ns from the start
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
+        self.setups: list[SetupRecord] = []
+        self.setup_hashes: set[int] = set()  # of their lines
+        self.beacons_ns: dict[tuple[int, int], int] = {}  # end of transmission, by session and number
+        self.imu_uses_at_status: list[str | None] = []  # of the newest predicted pose
+        self.jumps_m = array("d")  # of the predicted poses that state one
+        self.trackers: set[tuple[int, int]] = set()  # stations and prisms that poses name together
+        self._predicted_imu: str | None = None
         self.counts_at_status: list[tuple[PublishedCounts, PublishedCounts]] = []
         self.events: list[EventRecord] = []
         self.poll_replies: list[PollReply] = []  # received over protocol classic
@@ -160,17 +168,26 @@ class MasterLog:
         elif isinstance(record, StatusRecord):
             self.statuses.append(record)
             self.counts_at_status.append((self._counts_before_poses, self._counts))
+            self.imu_uses_at_status.append(self._predicted_imu)
+        elif isinstance(record, SetupRecord):
+            self.setups.append(record)
+            self.setup_hashes.add(hash(line))
         elif isinstance(record, EventRecord):
             self.events.append(record)
         elif isinstance(record, PoseRecord):
             self.pose_counts[record.series] += 1
             self.epochs_ns.setdefault(record.series, array("q")).append(record.stamp_ns)
             self._count(record)
+            if record.kind == "predicted":
+                self._predicted_imu = record.imu
+                if record.jump_m is not None:
+                    self.jumps_m.append(record.jump_m)
             self.predicted_with_imu += record.kind == "predicted" and record.imu == "used"
             if record.valid:
                 self._observe_pose(record)
         elif isinstance(record, BeaconRecord):
             first = self._first_beacon = self._first_beacon or record
+            self.beacons_ns[record.session, record.counter] = record.stamp_ns
             self.session_number = record.session
             self.frame_count, self.frames_duration_ns = (
                 record.counter - first.counter,
@@ -195,6 +212,7 @@ class MasterLog:
         self._pose_numbers.extend(pose.orientation_xyzw or ())
         self._pose_numbers.append(np.nan if pose.residual_m is None else pose.residual_m)
         ages_s = [np.nan if share.age_s is None else share.age_s for share in pose.stations]
+        self.trackers.update((share.id, share.prism) for share in pose.stations)
         self._pose_station_ages_s.extend(ages_s)
         self._pose_numbers.append(min((age_s for age_s in ages_s if age_s == age_s), default=np.nan))
         self._pose_sent_ages_s.append((self._now_ns() + self.unix_at_zero_ns - pose.stamp_ns) / 1e9)
@@ -286,11 +304,15 @@ class JournalIndex:
         journals = [load_journal(path) for path in station_log.journals if _has_header(path)]
         self.journalled = [m for journal in journals for m in journal.measurements]
         self._heads = {m.sequence: journal.head for journal in journals for m in journal.measurements}
+        self.sent_us: dict[
+            tuple[int, int], int
+        ] = {}  # when a beacon was sent by the master's session time, by session and number
         self._offsets_us: dict[tuple[str, int], list[int]] = {}
         for journal in journals:
             for reception in journal.receptions:
                 offsets_us = self._offsets_us.setdefault((journal.head.boot, reception.session), [])
                 offsets_us.append(reception.sent_us - reception.stamp_ns // 1000)
+                self.sent_us[reception.session, reception.counter] = reception.sent_us
         # By modification time, because Unix clock steps may reorder the names.
         last = max(station_log.journals, key=lambda path: path.stat().st_mtime_ns, default=None)
         self._last_journal = last if last is not None and _has_header(last) else None

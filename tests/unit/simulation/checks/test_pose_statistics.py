@@ -56,7 +56,10 @@ def _drive(*, late_s: float = 0.0, stamp_error_s: float = 0.0, stated: float = 1
         for number in (1, 2, 3)
     ]
     log = SimpleNamespace(
-        valid_poses=lambda: ValidPoses(**columns), unix_at_zero_ns=START, measurements=measured
+        valid_poses=lambda: ValidPoses(**columns),
+        unix_at_zero_ns=START,
+        measurements=measured,
+        trackers=set(),
     )
     result = SimpleNamespace(
         parameters=PARAMETERS, true_poses=_pose_at, world=SimpleNamespace(pose_at=_pose_at)

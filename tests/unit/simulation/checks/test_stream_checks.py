@@ -109,6 +109,7 @@ def test_status_with_a_wrong_size_of_the_recording(
         ([0, 3, 4, 4], 1),
         ([0, 3, 4, 9], 1),
         ([0, 9, 4], 1),
+        ([0, 4, 5, 6], 1),
         ([0, 3], 0),
         ([], 0),
     ],
@@ -116,7 +117,7 @@ def test_status_with_a_wrong_size_of_the_recording(
 def test_lines_that_a_reader_got(tmp_path: Path, heard: list[int], count: int) -> None:
     """Line 0 is a greeting, 3 the set-up, 4 to 6 follow, 9 is unknown."""
     log = _log(tmp_path)
-    log.line_hashes, log.heard = array("q", [3, 4, 5, 6]), [array("q", heard)]
+    log.line_hashes, log.heard, log.setup_hashes = array("q", [3, 4, 5, 6]), [array("q", heard)], {3}
     assert len(list(heard_failures(log))) == count
 
 

@@ -12,7 +12,7 @@ from harness import defects_of_strangers as d
 from planted_defects import Defect, silent_station
 
 from tsgt.simulation.faults import FaultKind as F
-from tsgt.simulation.mission import MASTER
+from tsgt.simulation.mission import MASTER, station_name
 
 if TYPE_CHECKING:
     from tsgt.simulation.mission import Mission
@@ -27,20 +27,28 @@ async def full_disk(mission: Mission) -> None:
     await mission.sleep_until(45.0)
 
 
+async def killed_client(mission: Mission) -> None:
+    """Kill the client of station 2 twice, the second time without radio contact."""
+    await mission.sleep_until(20.0)
+    await mission.crash(station_name(2), down_s=2.0)
+    mission.air.link.set_attenuation(MASTER, station_name(2), 300.0)
+    await mission.sleep_until(32.0)
+    await mission.crash(station_name(2), down_s=2.0)
+    mission.air.link.set_attenuation(MASTER, station_name(2), 0.0)
+
+
 # What a user would see comes after the colon.
 DEFECTS = {
     # Client
     "numbers-again": Defect(
         "a restarted client numbers from 0 again: two measurements with one number, one of them lost",
         d.number_from_zero_again,
-        (F.CLIENT_CRASH,),
-        duration_s=100,
+        script=killed_client,
     ),
     "acknowledged-ahead": Defect(
-        "a journal's acknowledgement is five ahead: a restarted client never delivers those",
+        "a journal's acknowledgement is 40 ahead: a restarted client never delivers those",
         d.journal_too_many_acknowledged,
-        (F.CLIENT_CRASH, F.LOSS),
-        duration_s=180,
+        script=killed_client,
     ),
     "queued": Defect(
         "`tsgt status` of a station always shows 0 queued: it is switched off with its backlog",

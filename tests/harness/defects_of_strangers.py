@@ -50,13 +50,13 @@ def number_from_zero_again(planting: Planting) -> None:
 
 
 def journal_too_many_acknowledged(planting: Planting) -> None:
-    """Journal an acknowledgement that is five measurements ahead."""
+    """Journal an acknowledgement that is 40 measurements ahead."""
 
     def write(original: Any) -> Any:
         def defective(self: Any) -> None:
-            self._acknowledged += 5
+            self._acknowledged += 40
             original(self)
-            self._acknowledged -= 5
+            self._acknowledged -= 40
 
         return defective
 

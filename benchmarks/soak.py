@@ -37,7 +37,7 @@ from tsgt.estimation import imu_setup_monitor
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.log import configure_logging
 from tsgt.simulation.checks import check_invariants
-from tsgt.simulation.faults import FAST_SYNC_CYCLES, FaultKind
+from tsgt.simulation.faults import FAST_SYNC_CYCLES, FIELD_DAY_FAULTS, FaultKind
 from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import find_scenario, with_stations
@@ -97,7 +97,7 @@ class Mission:
             stations,
             None if imu == "none" else float(rng.choice([5.0, 10.0, 20.0])),
             imu == "none" or bool(rng.random() < 0.5),
-            frozenset(FaultKind if imu == "none" else _some_kinds(rng)),
+            frozenset(FaultKind if imu == "none" else _some_kinds(rng)) - FIELD_DAY_FAULTS,
             bool(rng.random() < REPLAYED_SHARE) or estimator == "linear",
             odometry,
         )

@@ -464,11 +464,20 @@ class Mission:
                     writer.close()
 
     async def restart(self, station: int | None, at_s: float) -> None:
-        """Stop a client (None: the master) at a true time in s from the start, and restart it."""
+        """Stop a client (None: the master) at a true time in s from the start, and restart it.
+
+        Later if it is down, or its computer is suspended.
+        """
         await self.sleep_until(at_s)
-        await self.stop(MASTER if station is None else station_name(station))
-        await self.sleep_until(at_s + RESTART_DELAY_S)
-        self._start(MASTER if station is None else station_name(station))
+        name = MASTER if station is None else station_name(station)
+        computer = self.computers[name]
+        while computer.is_down or computer.is_suspended:
+            await asyncio.sleep(RESTART_DELAY_S)
+        computer.is_down = True
+        await self.stop(name)
+        await asyncio.sleep(RESTART_DELAY_S)
+        computer.is_down = False
+        self._start(name)
 
     def _start(self, name: str) -> None:
         if name == MASTER:

@@ -79,3 +79,16 @@ def test_suspended_computer_is_neither_rebooted_nor_killed(tmp_path: Path) -> No
 
     result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=10.0)
     assert len(result.station_logs[2].journals) == 2  # the client begins anew when it is resumed
+
+
+@pytest.mark.slow
+def test_restart_waits_for_a_computer_that_is_switched_off(tmp_path: Path) -> None:
+    """Two clients on one computer would serve the same socket."""
+
+    async def restart(mission: Mission) -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(mission.reboot(2, 4.0, 4.0))
+            group.create_task(mission.restart(2, 5.0))
+
+    result = run_mission(tmp_path, _linear(), script=restart, protocol=SUPERFRAME, duration_s=16.0)
+    assert len(result.station_logs[2].journals) == 3

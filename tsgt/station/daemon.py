@@ -186,6 +186,7 @@ class _StationClient:
             ClassicLink(
                 self._session,
                 self._clock,
+                watch,
                 timeline,
                 on_command=self._on_command,
                 create_task=group.create_task,

@@ -16,7 +16,7 @@ from tsgt.station.status import LinkStatus
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-    from tsgt.clock import Clock, UnixTimeline
+    from tsgt.clock import Clock, SuspensionWatch, UnixTimeline
     from tsgt.model import PolarMeasurement
     from tsgt.radio import Command, DirectCommand, Packet, Radio, TrackCommand
     from tsgt.recording.journal import TargetRecord
@@ -48,6 +48,7 @@ class ClassicLink:
         self,
         session: ClientSession,
         clock: Clock,
+        watch: SuspensionWatch,
         timeline: UnixTimeline,
         *,
         on_command: Callable[[Command], None],
@@ -55,6 +56,7 @@ class ClassicLink:
     ) -> None:
         self._session = session
         self._clock = clock
+        self._watch = watch
         self._timeline = timeline
         self._on_command = on_command
         self._create_task = create_task
@@ -104,11 +106,15 @@ class ClassicLink:
             log.warning("response_not_sent", error=str(error))
 
     async def run(self, radio: Radio) -> NoReturn:
-        """Reply to each request; nothing here waits for anything but the radio."""
+        """Reply to each request; nothing here waits for anything but the radio.
+
+        Raises ComputerSuspendedError after a suspension: no reply mixes times from before and after it. Raises RadioError.
+        """
         self._radio = radio
         try:
             while True:
                 packet = await radio.receive()
+                self._watch.check()
                 if self._clock.monotonic_ns() - packet.received_at_ns > TURNAROUND_NS:
                     # This computer was busy; the master polls another station by now.
                     log.warning("request_expired")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 from harness.radios import MS
 
-from tsgt.clock import UnixTimeline
-from tsgt.errors import RadioError
+from tsgt.clock import SuspensionWatch, UnixTimeline
+from tsgt.errors import ComputerSuspendedError, RadioError
 from tsgt.model import PolarMeasurement, Status
 from tsgt.radio import DirectCommand, MeasureCommand, Packet, SearchCommand, TrackCommand, Transmission
 from tsgt.radio.classic import MeasurementMessage
@@ -62,10 +62,12 @@ class Client:
         self.air = Air()
         self.clock = VirtualClock(START)
         self.session = ClientSession(3, 1)
+        self.suspended_ns = 0
         self.commands: list[Command] = []
         self.link = ClassicLink(
             self.session,
             self.clock,
+            SuspensionWatch(lambda: self.suspended_ns),
             UnixTimeline(START),
             on_command=self.commands.append,
             create_task=group.create_task,
@@ -160,6 +162,17 @@ async def test_every_status_is_encoded(status: Status, raw: int) -> None:
         made.link.offer(made.measure(START, status=status))
         message = await made.poll()
     assert (message.status, message.time_ns) == (raw, START)
+
+
+async def test_no_reply_after_a_suspension() -> None:
+    """The request would be later by the suspension than the measurement on the same clock."""
+    with pytest.RaisesGroup(ComputerSuspendedError):
+        async with client() as made:
+            made.link.offer(made.measure(START))
+            made.suspended_ns = 2_000_000_000
+            await made.send(b"e3")
+            pytest.fail("it goes on")
+    assert made.air.sent.empty()
 
 
 async def test_delayed_measurement_of_old_prism_is_not_offered() -> None:

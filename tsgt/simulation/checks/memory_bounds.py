@@ -9,6 +9,7 @@ from tsgt.master.classic import DUPLICATE_WINDOW
 from tsgt.master.stream_server import QUEUE_LINES
 from tsgt.radio.superframe import QUEUE_CAPACITY
 from tsgt.recording.recorder import HUNG_DISK_FACTOR, MAX_PENDING_LINES
+from tsgt.station.backlog import MAX_MEASUREMENTS, MAX_RECEPTIONS
 from tsgt.timesync import MAX_SAMPLES
 
 MAX_ENTRIES = 500
@@ -22,6 +23,8 @@ STATED_BOUNDS = {
     ("StationIngest", "_known"): DUPLICATE_WINDOW,
     ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
     ("SendQueue", "_queue"): QUEUE_CAPACITY,
+    ("Backlog", "queued"): MAX_MEASUREMENTS,
+    ("Backlog", "receptions"): MAX_RECEPTIONS,
     ("ImuSetupMonitor", "_records"): MAX_IMU_LINES,
     ("ImuTakeover", "_records"): MAX_IMU_LINES,
     **dict.fromkeys(

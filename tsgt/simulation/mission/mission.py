@@ -471,7 +471,7 @@ class Mission:
         await self.sleep_until(at_s)
         name = MASTER if station is None else station_name(station)
         computer = self.computers[name]
-        while computer.is_down or computer.is_suspended:
+        while computer.is_down or computer.is_suspended:  # noqa: ASYNC110 (waits in virtual time)
             await asyncio.sleep(RESTART_DELAY_S)
         computer.is_down = True
         await self.stop(name)

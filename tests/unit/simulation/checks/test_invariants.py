@@ -229,7 +229,7 @@ def test_acknowledged_but_lost_measurement_is_detected(result: MissionResult, tm
     lines = recording.read_bytes().splitlines(keepends=True)
     index = next(i for i, line in enumerate(lines) if line.startswith(b'{"type":"measurement","station":2'))
     (tmp_path / recording.name).write_bytes(b"".join(lines[:index] + lines[index + 1 :]))
-    session._folder = tmp_path
+    session.folder = tmp_path
     station_log = result.station_logs[2]
     delivered = sum(measurement.station == 2 for measurement in session.measurements)
     missing = len(JournalIndex(station_log).journalled) - delivered + 1

@@ -95,7 +95,7 @@ def test_recording_without_a_line_has_no_samples(mission: MissionResult, tmp_pat
     """A master that is killed at once leaves an empty file."""
     (tmp_path / "master.jsonl").touch()
     empty = copy.copy(mission.master_logs[0])
-    empty._folder = tmp_path
+    empty.folder = tmp_path
     assert list(imu_failures(replace(mission, master_logs=[*mission.master_logs, empty]))) == []
 
 
@@ -106,7 +106,7 @@ def test_samples_missing_after_the_faults_violate_the_invariant(mission: Mission
     assert list(imu_failures(ended)) == []
     (log,) = mission.master_logs
     empty = copy.copy(log)
-    empty._folder = log._folder / "empty"
+    empty.folder = log.folder / "empty"
     (failure,) = imu_failures(replace(ended, master_logs=[empty]))
     assert "are not recorded" in failure
 

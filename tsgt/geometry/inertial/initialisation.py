@@ -16,6 +16,7 @@ from tsgt.geometry.inertial.preintegration import preintegrate
 from tsgt.geometry.inertial.solver import InertialSetup, inertial_knot_times, solve_inertial
 from tsgt.geometry.inertial.states import Gravity, InertialStates
 from tsgt.geometry.rigid import FloatArray, exp_so3, log_so3, matvec
+from tsgt.geometry.trajectory.gauss_newton import LOOSE_GAIN_TOLERANCE
 
 if TYPE_CHECKING:
     from tsgt.geometry.inertial.solver import InertialSolution
@@ -74,6 +75,7 @@ def search_heading(observations: Observations, setup: InertialSetup, gravity: Gr
                     states_on_tracks(observations, time_s, rotation, zero),
                     gravity,
                     max_iterations=SEARCH_ITERATIONS,
+                    gain_tolerance=LOOSE_GAIN_TOLERANCE,
                     reject_outliers=False,
                 )
             )

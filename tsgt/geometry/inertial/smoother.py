@@ -186,17 +186,20 @@ def fit_inertial_trajectory(
         return found, some, solved.start
 
     first = int(np.clip(edges_s.searchsorted(near.time_s[0], side="right") - 1, 0, count - 1))
-    while (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
-        if near.time_s[0] <= time_s[0] and near.time_s[-1] >= time_s[-1]:
-            break
+    whole: tuple[InertialSolution, Observations, int] | None = None
+    while whole is None and (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
         margin_s = 0.5 * (START_GROWTH - 1.0) * length_s
-        near = solve(near.time_s[0] - margin_s, near.time_s[-1] + margin_s, near)[0].knots
+        grown = solve(near.time_s[0] - margin_s, near.time_s[-1] + margin_s, near)
+        near = grown[0].knots
+        if len(near) == len(time_s):
+            whole = grown
     parts: dict[int, _Part] = {}
     for number in [*range(first, count), *range(first - 1, -1, -1)]:
         report_progress(len(parts) / count)
         if parts:
             near = parts[number - 1 if number > first else number + 1].knots
-        solution, some, offset = solve(edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near)
+        ends_s = edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S
+        solution, some, offset = whole if whole is not None else solve(*ends_s, near)
         kept = slice(ends[number] - offset, ends[number + 1] - offset)
         parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian, mounting_factor)
     ordered = [parts[number] for number in range(count)]

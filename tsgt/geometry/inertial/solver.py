@@ -26,6 +26,7 @@ from tsgt.geometry.trajectory.gauss_newton import (
     INITIAL_POSITION_SIGMA_M,
     INITIAL_ROTATION_SIGMA_RAD,
     INITIAL_VELOCITY_SIGMA_MPS,
+    LOOSE_GAIN_TOLERANCE,
     MAX_ITERATIONS,
     MIN_STEP_FRACTION,
     OUTLIER_THRESHOLD,
@@ -52,6 +53,9 @@ MAX_BIAS_ROTATION_RAD = 2e-3
 """Rotation by a change of the gyro's bias over a step beyond which it is integrated again. To first order the correction
 is wrong by half its square.
 """
+
+FAR_GAIN = 1e4
+"""Predicted gain of a step beyond which it does not lead to the minimum yet: there the samples need not be integrated again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,13 +162,14 @@ def solve_inertial(
     anchor: InertialAnchor | None = None,
     factors: InertialFactors | None = None,
     max_iterations: int = MAX_ITERATIONS,
+    gain_tolerance: float = PREDICTED_GAIN_TOLERANCE,
     reject_outliers: bool = True,
 ) -> InertialSolution:
     """Find the maximum a posteriori trajectory from observations in any order.
 
     ``observations``: with the layout in the IMU's axes, from its origin. ``guess``: states at the knot times of the result,
     rotations within about half a radian of the solution. ``anchor``: prior on the first knot and what all knots share; diffuse when not
-    given. ``factors``: between the knots of the guess, when they are at hand. Raises GeometryError: the measurements do not
+    given. ``factors``: between the knots of the guess, when they are at hand. ``gain_tolerance``: as without an IMU. Raises GeometryError: the measurements do not
     determine the trajectory.
     """
     if anchor is None:
@@ -174,18 +179,19 @@ def solve_inertial(
     if factors is None:
         factors = setup.factors(guess)
     knot_index = nearest_knots(guess.time_s, observations.time_s)
-    search = _Search(observations, knot_index, setup, anchor, setup.samples.at(guess.time_s))
+    kinematics = setup.samples.at(guess.time_s)
+    search = _Search(observations, knot_index, setup, anchor, kinematics, gain_tolerance)
     found = search.minimise(guess, gravity, factors, max_iterations)
     if not reject_outliers or not (found.squared_distances > REJECTION_THRESHOLD**2).any():
         return found
     # As without an IMU: good measurements are outliers of a local minimum, which a coarse search leaves.
     if max_iterations >= MAX_ITERATIONS:
         coarse = guess
+        loose = replace(search, gain_tolerance=LOOSE_GAIN_TOLERANCE)
         for scale in COARSE_NOISE_SCALES:
-            rough = replace(observations, sigmas_m=scale * observations.sigmas_m)
-            rough_search = replace(search, observations=rough)
-            coarse = rough_search.minimise(coarse, gravity, factors, max_iterations).knots
-        again = search.minimise(coarse, gravity, factors, max_iterations)
+            rough = replace(loose, observations=replace(observations, sigmas_m=scale * observations.sigmas_m))
+            coarse = rough.minimise(coarse, gravity, factors, max_iterations).knots
+        again = loose.minimise(coarse, gravity, factors, max_iterations)
         found = min(found, again, key=lambda solution: solution.cost)
     rejectable = np.ones(len(knot_index), np.bool_)
     second = replace(search, rejectable=rejectable).minimise(
@@ -203,6 +209,7 @@ class _Search:
     setup: InertialSetup
     anchor: InertialAnchor
     kinematics: tuple[FloatArray, FloatArray]  # angular rate and specific force at the knots
+    gain_tolerance: float
     rejectable: NDArray[np.bool_] | None = None
 
     def minimise(
@@ -213,11 +220,17 @@ class _Search:
         factors = self._integrated_again(knots, factors)
         system = self._evaluate(knots, gravity, factors)
         factor = _factorise(system)
+        far = False
         while iterations < max_iterations:
             iterations += 1
             step, shared = factor.solve(-system.gradient, -system.corner_gradient)
             gain = -float(np.vdot(step, system.gradient) + np.vdot(shared, system.corner_gradient))
-            if gain < PREDICTED_GAIN_TOLERANCE:
+            if gain < self.gain_tolerance:
+                if far and (integrated := self._integrated_again(knots, factors)) is not factors:
+                    factors, far = integrated, False
+                    system = self._evaluate(knots, gravity, factors)
+                    factor = _factorise(system)
+                    continue
                 knots, gravity = knots.retract(step), gravity.retract(shared)
                 system = apply_linear_step(system, self.knot_index, step, gain)
                 break
@@ -233,7 +246,8 @@ class _Search:
                 break
             decrease = system.cost - candidate.cost
             knots, gravity, system = moved, moved_gravity, candidate
-            integrated = self._integrated_again(knots, factors)
+            far = gain > FAR_GAIN
+            integrated = factors if far else self._integrated_again(knots, factors)
             if integrated is not factors:
                 factors, decrease = integrated, np.inf
                 system = self._evaluate(knots, gravity, factors)

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 MAX_ITERATIONS = 25
 MAX_KNOT_CHOICES = 5
+MAX_ALL_ITERATIONS = (
+    40  # Of all choices of knots while the latency moves on; a drive that tells it needs some 10
+)
 MAX_LATENCY_STEP_S = 0.002  # By which the latency may move until knots are chosen again
 
 
@@ -73,7 +76,7 @@ def solve_jointly(
     Raises GeometryError: the measurements determine neither.
     """
     setup = prior.mean if start is None else start
-    solution, chosen_latency_s = None, setup.latency_s
+    solution, chosen_latency_s, iterations = None, setup.latency_s, 0
     for _ in range(MAX_KNOT_CHOICES):
         latency_s = setup.latency_s
         times_s, knot_index = knots_at_samples(stamp_times(observations, setup), samples)
@@ -90,11 +93,16 @@ def solve_jointly(
         setup, gravity = solution.point.setup, solution.point.gravity
         if abs(setup.latency_s - chosen_latency_s) < MAX_LATENCY_STEP_S:
             break
+        iterations += solution.iterations
+        if iterations >= MAX_ALL_ITERATIONS:
+            solution = None
+            break
     else:
+        solution = None
+    if solution is None:
         raise GeometryError(
             "the latency of the IMU does not converge: its samples do not belong to this drive"
         )
-    assert solution is not None  # noqa: S101 (there is at least one choice of knots)
     if (solution.equations.states.squared_distances > REJECTION_THRESHOLD**2).any():
         rejectable = np.ones(len(observations), np.bool_)
         solution = minimise(replace(solution.problem, rejectable=rejectable), solution.point, on_iteration)

@@ -88,10 +88,10 @@ def run(kinds: Sequence[str], seed: int, *, with_poses: bool) -> Day:
     recording = calibrated(day)
     parameters = recording.parameters
     with Stopwatch() as stopwatch:
-        observations, sources = build_observations(parameters, recording.measurements, origin_ns=START_NS)
+        observations, _ = build_observations(parameters, recording.measurements, origin_ns=START_NS)
         motion = estimate_motion_model(observations, parameters.pipeline)
         held_out = held_out_errors(observations, parameters) if with_poses else None
-        findings = diagnose(parameters, sources, motion, origin_ns=START_NS, held_out=held_out).findings
+        findings = diagnose(parameters, observations, motion, held_out=held_out).findings
     findings = tuple(each for each in findings if each.cause not in NOT_A_CAUSE)
     named = [c.kind.value for c in day.causes if any(matches(f, c) for f in findings)]
     listed = [c.kind.value for c in day.causes if any(matches(f, c, alternatives=True) for f in findings)]

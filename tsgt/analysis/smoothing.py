@@ -108,6 +108,12 @@ class SmoothedRecording(SmoothedPoses):
     fit: TrajectoryFit | InertialFit
     origin_ns: int
 
+    def observations_with(self, parameters: Parameters) -> Observations:
+        """Return the observations with a set-up that may differ from the one that was used."""
+        if parameters is self.parameters:
+            return self.observations
+        return build_observations(parameters, self.sources, origin_ns=self.origin_ns)[0]
+
 
 def smooth_poses(
     recording: Recording,

@@ -79,10 +79,12 @@ def analyse(observations: Observations, parameters: Parameters, motion: MotionMo
     if lock_loss is not None:
         observations = without_lock_losses(observations, lock_loss)
         motion = estimate_motion_model(layout.corrected(observations, errors), parameters.pipeline)
+        linearised = linearise_setup(layout, observations, errors, motion.prior, floored(motion))
     chosen: frozenset[CauseHypothesis] | None = None
     noise = floored(motion)
-    for _ in range(MAX_ROUNDS):
-        linearised = linearise_setup(layout, observations, errors, motion.prior, noise)
+    for number in range(MAX_ROUNDS):
+        if number:
+            linearised = linearise_setup(layout, observations, errors, motion.prior, noise)
         selection = CauseSelection(linearised.information, nominal, candidates)
         found = selection.search(chosen or frozenset())
         if found == chosen:

@@ -15,17 +15,17 @@ from tsgt.analysis.diagnosis.held_out_finding import held_out_finding, held_out_
 from tsgt.analysis.diagnosis.noise_findings import noise_findings
 from tsgt.analysis.diagnosis.residual_patterns import residual_patterns
 from tsgt.analysis.diagnosis.target_findings import calibration_findings
-from tsgt.estimation import build_observations
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from tsgt.analysis.diagnosis.finding import Finding
     from tsgt.analysis.diagnosis.held_out_finding import Part
     from tsgt.analysis.diagnosis.residual_patterns import ResidualPattern
     from tsgt.analysis.evaluation import HeldOutErrors, InterPrismDistances, Predictor
     from tsgt.analysis.smoothing import MotionModel, SmoothedRecording
-    from tsgt.model import Measurement, Parameters
+    from tsgt.geometry.trajectory import Observations
+    from tsgt.model import Parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,19 +53,17 @@ class Diagnosis:
 
 def diagnose(
     parameters: Parameters,
-    sources: Sequence[Measurement],
+    observations: Observations,
     motion: MotionModel,
     *,
-    origin_ns: int,
     held_out: Mapping[Predictor, HeldOutErrors] | None = None,
     distances: InterPrismDistances | None = None,
 ) -> Diagnosis:
     """Diagnose a recording.
 
-    ``sources``: its measurements; ``motion``: estimated from them; ``held_out``: errors of the same measurements; ``distances``:
+    ``observations``: its measurements with the recorded set-up and the stated noise; ``motion``: estimated from them; ``held_out``: errors of the same measurements; ``distances``:
     between its prisms. Raises GeometryError: the measurements do not determine a trajectory.
     """
-    observations, _ = build_observations(parameters, sources, origin_ns=origin_ns)
     analysis = analyse(observations, parameters, motion)
     layout_m = np.array([each.position_m for each in parameters.prisms])
     findings = [
@@ -99,9 +97,8 @@ def diagnose_smoothed(
     """Diagnose a smoothed recording; see :func:`diagnose`."""
     return diagnose(
         parameters,
-        smoothed.sources,
+        smoothed.observations_with(parameters),
         smoothed.motion,
-        origin_ns=smoothed.origin_ns,
         held_out=held_out,
         distances=distances,
     )

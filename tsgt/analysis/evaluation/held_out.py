@@ -2,7 +2,8 @@
 
 Needs no reference, and errors that all prisms share do not cancel: the measured position of a prism is compared with the
 prediction of the estimator fitted without that measurement. The measurements of each prism are dealt in turn into five
-folds; each fold of one prism is held out once. docs/reference/evaluate.md defines the figures.
+folds; each fold of one prism is held out once. Of a long recording only the measurements of a few spans are held out.
+docs/reference/evaluate.md defines the figures.
 """
 
 from __future__ import annotations
@@ -47,6 +48,10 @@ PREDICTOR_NAMES: dict[Predictor, str] = {
 
 FOLDS = 5
 
+MAX_WHOLE_S = 900.0  # Longer recordings are sampled: their figures would hardly change, and take minutes
+SPANS, SPAN_S = 6, 30.0  # Evenly spread
+CONTEXT_S = 5.0  # On either side of a span, for the trajectory; the motion prior forgets in a second or two
+
 EDGE = 5  # First and last measurements of a prism that are never held out (extrapolation)
 GAP_S = 1.0  # A held-out measurement whose neighbours are further apart counts as one at a gap
 
@@ -57,8 +62,8 @@ class Fold:
 
     Attributes
     ----------
-    number : 0 to 4.
-    test, training : Rows of the observations that are held out, and all others; increasing.
+    number : 0 to 4; always 0 in a long recording. Folds of one number share hyperparameters and set-up.
+    test, training : Rows of the observations that are held out, and all others, in a long recording those near; increasing.
     at_gap : For each of ``test``: the prism's neighbours before and after it are more than :data:`GAP_S` apart.
     """
 
@@ -127,21 +132,42 @@ class HeldOutErrors:
 
 
 def folds(observations: Observations) -> list[Fold]:
-    """Split observations, in the order of time, into up to five folds per prism, by number; none with too few measurements."""
+    """Split observations, in the order of time, into up to five folds per prism, by number; none with too few measurements.
+
+    If they last longer than :data:`MAX_WHOLE_S` and are of three prisms, each span in which all prisms are measured is split.
+    """
+    time_s = observations.time_s
+    prisms = np.unique(observations.prism)
+    if len(prisms) < MIN_PRISMS or time_s[-1] - time_s[0] <= MAX_WHOLE_S:
+        return _folds(observations, np.arange(len(time_s)))
+    splits = []
+    for share in (np.arange(SPANS) + 0.5) / SPANS:
+        middle_s = time_s[0] + share * (time_s[-1] - time_s[0])
+        margin_s = np.array([-0.5, 0.5]) * SPAN_S
+        first, last = np.searchsorted(time_s, middle_s + margin_s + [-CONTEXT_S, CONTEXT_S])
+        if len(np.unique(observations.prism[first:last])) == len(prisms):
+            splits += _folds(observations, np.arange(first, last), middle_s + margin_s)
+    return [replace(fold, number=0) for fold in splits]
+
+
+def _folds(
+    observations: Observations, rows: NDArray[np.intp], within_s: FloatArray | None = None
+) -> list[Fold]:
+    """Split consecutive ``rows``; only what was measured ``within_s``, (2,), is held out."""
     splits = []
     for number in range(FOLDS):
         for prism in range(len(observations.layout)):
-            rows = np.flatnonzero(observations.prism == prism)
-            indices = np.arange(number, len(rows), FOLDS)
-            indices = indices[(indices >= EDGE) & (indices < len(rows) - EDGE)]
+            own = rows[observations.prism[rows] == prism]
+            time_s = observations.time_s[own]
+            indices = np.arange(number, len(own), FOLDS)
+            indices = indices[(indices >= EDGE) & (indices < len(own) - EDGE)]
+            if within_s is not None:
+                indices = indices[(time_s[indices] >= within_s[0]) & (time_s[indices] <= within_s[1])]
             if not len(indices):
                 continue
-            time_s = observations.time_s[rows]
             # The neighbours belong to other folds and remain in the training set.
             at_gap = time_s[indices + 1] - time_s[indices - 1] > GAP_S
-            training = np.ones(len(observations), np.bool_)
-            training[rows[indices]] = False
-            splits.append(Fold(number, rows[indices], np.flatnonzero(training), at_gap))
+            splits.append(Fold(number, own[indices], np.setdiff1d(rows, own[indices]), at_gap))
     return splits
 
 
@@ -193,7 +219,7 @@ def held_out_errors(
 ) -> dict[Predictor, HeldOutErrors]:
     """Cross-validate both estimators on observations in the order of time, with the stated noise and the recorded set-up.
 
-    The hyperparameters are estimated and the set-up is refined five times, each time without the test measurements of one
+    The hyperparameters are estimated and the set-up is refined for each number, without the test measurements of that
     number's folds of all prisms, so that no prediction depends on the measurement that it is compared with; the pipeline's
     bound the hyperparameters from below, and replace them if the measurements are too few. ``linear`` has the recorded
     set-up. ``imu``: samples on the time axis of the observations, used for a third entry; ``continuous`` is missing where the
@@ -203,11 +229,12 @@ def held_out_errors(
     report = on_progress or (lambda _: None)
     splits = folds(observations)
     complete = len(np.unique(observations.prism)) >= MIN_PRISMS
-    models = []
-    for number in range(FOLDS if splits else 0):
-        report(number / (2 * FOLDS))
+    models = {}
+    numbers = sorted({fold.number for fold in splits})
+    for number in numbers:
+        report(number / (2 * len(numbers)))
         training = observations.select(training_rows(observations, number))
-        models.append(
+        models[number] = (
             _training_model(training, parameters, refine)
             if complete
             else (

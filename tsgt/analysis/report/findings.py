@@ -31,7 +31,7 @@ from tsgt.analysis.report.stations import station_records, station_statistics
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.analysis.validation import plausible_measurements
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import build_observations, build_tracks, centroid_at_point, point_label
+from tsgt.estimation import build_tracks, centroid_at_point, point_label
 from tsgt.geometry import check_layout, rotation_from_quaternion, transform_from
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ def collect_findings(
     held_out = None
     if with_held_out and continuous is not None:
         report(fitted + 0.1)
-        observations, _ = build_observations(parameters, continuous.sources, origin_ns=continuous.origin_ns)
+        observations = continuous.observations_with(parameters)
         held_out = attempt(
             "held_out",
             lambda: held_out_errors(

@@ -51,7 +51,7 @@ from tsgt.cli.recordings import (
     refine_option,
 )
 from tsgt.errors import GeometryError, RecordingError
-from tsgt.estimation import build_observations, build_tracks
+from tsgt.estimation import build_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -97,9 +97,9 @@ LISTED_OUTLIERS = 10
 @click.option(
     "--held-out/--no-held-out",
     "with_held_out",
-    default=None,
-    help="Compute the held-out prediction error, which takes most of the time.  "
-    "[default: on; off in a report of more than 15 min]",
+    default=True,
+    show_default=True,
+    help="Compute the held-out prediction error; in recordings of more than 15 min at samples.",
 )
 @click.option(
     "--report",
@@ -127,7 +127,7 @@ def evaluate(
     point: ReferencePoint | str | None,
     reference_point: ReferencePoint | str | None,
     align: Literal["none", "translation", "rigid"],
-    with_held_out: bool | None,
+    with_held_out: bool,
     report_folder: Path | None,
     odometry: Path | None,
     frames: Path | None,
@@ -182,7 +182,7 @@ def evaluate(
     if parameters.pipeline.estimator != "continuous":
         poses = process(loaded, path=recording)
     found = inter_prism(parameters, build_tracks(parameters, loaded.measurements))
-    predicted = _held_out(loaded, continuous, recording, refine) if with_held_out is not False else None
+    predicted = _held_out(loaded, continuous, recording, refine) if with_held_out else None
     rejected = outliers(continuous.fit, continuous.sources)
     residuals = residual_statistics(continuous.fit, continuous.sources)
     diagnosis = _diagnosis(loaded, continuous, predicted, found)
@@ -280,9 +280,7 @@ def _held_out(
     loaded: Recording, continuous: SmoothedRecording, path: Path, refine: Refine
 ) -> dict[Predictor, HeldOutErrors]:
     # Not the observations of the fit: their noise scale was estimated from all measurements, held-out ones included.
-    observations, _ = build_observations(
-        loaded.parameters, continuous.sources, origin_ns=continuous.origin_ns
-    )
+    observations = continuous.observations_with(loaded.parameters)
     try:
         with progress("predicting held-out measurements") as on_progress:
             return held_out_errors(

@@ -41,9 +41,6 @@ if TYPE_CHECKING:
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.recording import Recording
 
-MAX_HELD_OUT_S = 900.0
-"""The held-out prediction of a longer recording takes minutes and is made on request only."""
-
 PAGE_NAME = "report.html"
 NUMBERS_NAME = "report.json"
 
@@ -100,7 +97,7 @@ def report_evaluation(
     reference: Reference | None,
     align: Align | None = None,
     odometry: Path | None,
-    with_held_out: bool | None,
+    with_held_out: bool,
     refine: Refine,
     as_json: bool,
 ) -> None:
@@ -115,15 +112,12 @@ def report_evaluation(
     odometry
         File that defines the stationary intervals; None: from the measurements.
     with_held_out
-        Whether to compute the held-out prediction error; None: only for a short recording.
+        Whether to compute the held-out prediction error.
     refine
         What of the set-up may be refined.
     as_json
         Print the numbers instead of the verdicts.
     """
-    stamps = [m.stamp_ns for m in recording.measurements]
-    if with_held_out is None:
-        with_held_out = not stamps or max(stamps) - min(stamps) <= MAX_HELD_OUT_S * 1e9
     stationary_ns = None if odometry is None else read_stationary_intervals(odometry)
     with progress("evaluating", first=TUNING) as on_progress:
         findings = collect_findings(

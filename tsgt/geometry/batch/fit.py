@@ -30,7 +30,13 @@ from tsgt.geometry.rest import (
     steps_in_rest,
     with_vibration,
 )
-from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest_knots, solve
+from tsgt.geometry.trajectory.gauss_newton import (
+    LOOSE_GAIN_TOLERANCE,
+    PREDICTED_GAIN_TOLERANCE,
+    knot_times,
+    nearest_knots,
+    solve,
+)
 from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.query import Trajectory
@@ -53,6 +59,10 @@ KNOTS_PER_SEGMENT = 1024  # About two minutes of 3 stations at 2.5 Hz: their blo
 MAX_ADAPTED_ITERATIONS = (
     6  # From the solution before the last adaptation, which is close; two or three suffice
 )
+ADAPTATION_GAIN_TOLERANCE = 100.0
+"""As :data:`~tsgt.geometry.trajectory.gauss_newton.LOOSE_GAIN_TOLERANCE`, before all but the last adaptation: a third of a sigma for
+each of a thousand knots. The next solution relinearises, and the last one converges; the result differs by 0.01 sigmas at most.
+"""
 OVERLAP_KNOTS = 96  # Knots on either side of a segment that are solved with it and discarded
 
 
@@ -261,8 +271,10 @@ def _solve_adapting(
 ) -> _AdaptedSolution:
     """Solve, and adapt the process noise to the motion; arguments as for :func:`solve` and :func:`adapted_sigmas`."""
     sigmas = initial_sigmas
-    solution = solve(observations, guess, prior, sigmas=sigmas, rest=rest)
-    for _ in range(ADAPTATIONS):
+    solution = solve(
+        observations, guess, prior, sigmas=sigmas, rest=rest, gain_tolerance=LOOSE_GAIN_TOLERANCE
+    )
+    for last in (*[False] * (ADAPTATIONS - 1), True):
         marginals = solution.factor.marginals()
         sigmas = adapted_sigmas(
             solution, *marginals, sigmas=sigmas, initial_sigmas=initial_sigmas, adaptable=adaptable
@@ -274,6 +286,7 @@ def _solve_adapting(
             sigmas=sigmas,
             rest=rest,
             max_iterations=MAX_ADAPTED_ITERATIONS,
+            gain_tolerance=PREDICTED_GAIN_TOLERANCE if last else ADAPTATION_GAIN_TOLERANCE,
         )
     return _AdaptedSolution(solution, *solution.factor.marginals(), sigmas)
 

@@ -21,11 +21,9 @@ if TYPE_CHECKING:
 def findings_of(kinds: Sequence[Kind], seed: int) -> tuple[Finding, ...]:
     """Diagnose a short day."""
     recording = calibrated(field_day(kinds, seed, duration_s=120.0))
-    observations, sources = build_observations(
-        recording.parameters, recording.measurements, origin_ns=START_NS
-    )
+    observations, _ = build_observations(recording.parameters, recording.measurements, origin_ns=START_NS)
     motion = estimate_motion_model(observations, recording.parameters.pipeline)
-    return diagnose(recording.parameters, sources, motion, origin_ns=START_NS).findings
+    return diagnose(recording.parameters, observations, motion).findings
 
 
 @pytest.mark.slow

@@ -68,6 +68,35 @@ def test_training_rows_are_disjoint_from_the_test_rows_of_their_number() -> None
         assert not set(training_rows(some, part.number)) & set(part.test)
 
 
+def test_long_recordings_are_held_out_in_evenly_spread_spans() -> None:
+    """Six spans of 30 s of an hour; hyperparameters of one number come from what is outside of all of them."""
+    some = observations(10_800, step_s=1 / 3)
+    splits = folds(some)
+    assert {part.number for part in splits} == {0}
+    tests = np.concatenate([part.test for part in splits])
+    assert len(set(tests.tolist())) == len(tests)
+    expected = [each for middle in range(300, 3600, 600) for each in range(middle - 15, middle + 16)]
+    assert sorted(set(some.time_s[tests].round().astype(int).tolist())) == pytest.approx(expected, abs=2)
+    assert not set(training_rows(some, 0)) & set(tests)
+    assert len(training_rows(some, 0)) == len(some) - len(tests)
+
+
+def test_fold_of_a_long_recording_is_predicted_from_its_neighbourhood() -> None:
+    """All other measurements up to five seconds on either side of the span."""
+    some = observations(10_800, step_s=1 / 3)
+    for part in folds(some):
+        near = np.sort(np.concatenate([part.test, part.training]))
+        np.testing.assert_array_equal(near, np.arange(near[0], near[-1] + 1))
+        assert np.ptp(some.time_s[near]) == pytest.approx(40.0, abs=1.0)
+
+
+def test_span_without_a_prism_is_not_held_out() -> None:
+    """There no trajectory of the rest may be determined."""
+    some = observations(10_800, step_s=1 / 3)
+    outage = (np.abs(some.time_s - 300.0) < 60.0) & (some.prism == 0)
+    assert min(float(some.time_s[part.test[0]]) for part in folds(some.select(~outage))) > 600.0
+
+
 def test_gaps_are_counted_separately() -> None:
     """Measurements whose remaining neighbours are more than a second apart."""
     some = observations()

@@ -8,6 +8,7 @@ Cholesky factorises them in linear time; marginal covariances follow from the fa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,8 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs, dtrtri
 from tsgt.errors import GeometryError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from tsgt.geometry.rigid import FloatArray
 
 _BLOCKS_PER_CHUNK = 64  # Chunk that stays in the L1 cache: twice as fast as all blocks in one pass
@@ -39,12 +42,25 @@ class BlockCholesky:
 
     def last_block(self) -> FloatArray:
         """(B, B) lower triangle L: ``L L^T`` is the Schur complement of the last block, all others eliminated."""
-        size = self.size
-        last_columns = self.banded[:, -size:]
-        lower = np.zeros((size, size))
-        for column in range(size):
-            lower[column:, column] = last_columns[: size - column, column]
+        rows, columns = _lower_triangle(self.size)
+        lower = np.zeros((self.size, self.size))
+        lower[rows, columns] = self.banded[rows - columns, columns - self.size]
         return lower
+
+    def with_last_block_added(self, block: FloatArray) -> BlockCholesky:
+        """Return the factor of the matrix with (B, B) ``block``, positive semidefinite, added to its last diagonal block.
+
+        Nothing before that block changes. Raises GeometryError as :func:`factorise`.
+        """
+        rows, columns = _lower_triangle(self.size)
+        last = self.last_block()
+        try:
+            lower = np.linalg.cholesky(last @ last.T + block)
+        except np.linalg.LinAlgError:
+            raise GeometryError("the measurements do not determine the trajectory") from None
+        banded = self.banded.copy(order="F")
+        banded[rows - columns, columns - self.size] = lower[rows, columns]
+        return BlockCholesky(banded, self.size)
 
     def marginals(self) -> tuple[FloatArray, FloatArray]:
         """Blocks of the inverse matrix: (K, B, B) on the diagonal and (K - 1, B, B) right of it."""
@@ -62,6 +78,12 @@ class BlockCholesky:
                 next_block = own[k]
             diagonal[start : start + len(own)] = 0.5 * (own + np.swapaxes(own, 1, 2))
         return diagonal, off_diagonal
+
+
+@cache
+def _lower_triangle(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of the lower triangle of a block."""
+    return np.tril_indices(size)
 
 
 def _inverse_and_sub_diagonal(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -84,11 +106,15 @@ def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
     column block k + 1.
     """
     count, size, _ = diagonal.shape
-    # LAPACK's band storage is column by column.
-    columns = np.zeros((count, size, 2 * size))
-    for column in range(size):
-        columns[:, column, : size - column] = diagonal[:, column:, column]
-        columns[:-1, column, size - column : 2 * size - column] = off_diagonal[:, column]
+    # LAPACK's band storage is column by column, each from the diagonal down: a column of both blocks, one below the other, and
+    # zeros, from its own number on.
+    full = np.zeros((count, size, 3 * size))
+    full[:, :, :size] = np.swapaxes(diagonal, 1, 2)
+    full[:-1, :, size : 2 * size] = off_diagonal
+    of_block, of_column, of_row = full.strides
+    columns = np.lib.stride_tricks.as_strided(
+        full, (count, size, 2 * size), (of_block, of_column + of_row, of_row), writeable=False
+    ).copy()
     # LAPACK directly: scipy's checks cost more than a system of the fixed lag, of which there are a dozen a second.
     factor, failed = dpbtrf(columns.reshape(count * size, 2 * size).T, lower=True, overwrite_ab=True)
     if failed:

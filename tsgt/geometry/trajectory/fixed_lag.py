@@ -234,25 +234,27 @@ class FixedLagSmoother(MeasurementWindow):
         # The same comparison as in _insert_knots: rounding must not decide differently.
         if knots.time_s[0] - new.time_s[0] > 0.5 * MIN_KNOT_SPACING_S:
             return False  # in the first window, earlier than all others
-        knots = _insert_knots(knots, new.time_s, self._prior)
-        if knots is not self._knots:
-            process = ProcessFactors.of(knots.time_s, self._prior)
+        knots, process = _insert_knots(knots, process, new.time_s, self._prior)
         knot_index = nearest_knots(knots.time_s, observations.time_s)
         is_new = time_order(held, new) >= len(held)
         system = assemble(
             observations, knot_index, knots, process, anchor, active=~is_new, rejectable=~is_new
         )
-        solve_system = factorise(system.diagonal, system.off_diagonal).solve
+        factor = factorise(system.diagonal, system.off_diagonal)
         nis, sequential_nis = normalised_innovations(
-            system.whitened[is_new], knot_index[is_new], system.gradient, solve_system
+            system.whitened[is_new], knot_index[is_new], system.gradient, factor.solve
         )
         weights = self._weigh(nis, sequential_nis)
         system.weights[is_new] = weights
+        last = system.diagonal[-1].copy()
         add_measurements(
             system.whitened[is_new], weights, knot_index[is_new], system.diagonal, system.gradient
         )
-        for _ in range(MAX_STEPS):
+        if (knot_index[is_new] == len(knots) - 1).all():
+            factor = factor.with_last_block_added(system.diagonal[-1] - last)
+        else:
             factor = factorise(system.diagonal, system.off_diagonal)
+        for _ in range(MAX_STEPS):
             step = factor.solve(-system.gradient)
             gain = -float(np.vdot(step, system.gradient))
             knots = knots.retract(step)
@@ -260,6 +262,7 @@ class FixedLagSmoother(MeasurementWindow):
                 outliers = self._accept(knots, process, factor, apply_linear_step(system, knot_index, step))
                 break
             system = assemble(observations, knot_index, knots, process, anchor, rejectable=~is_new)
+            factor = factorise(system.diagonal, system.off_diagonal)
         else:
             outliers = self._solve(knots, MAX_ITERATIONS)
         self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
@@ -306,14 +309,24 @@ def _determined_from_s(observations: Observations) -> float:
     return float(max(each_s[:2][-1] for each_s in since_gap))
 
 
-def _insert_knots(knots: States, time_s: FloatArray, prior: MotionPrior) -> States:
+def _insert_knots(
+    knots: States, process: ProcessFactors, time_s: FloatArray, prior: MotionPrior
+) -> tuple[States, ProcessFactors]:
     """Insert knots at measurement times that have none nearby; their states are propagated from the knot before."""
-    for instant_s in time_s:
-        if np.min(np.abs(knots.time_s - instant_s)) > 0.5 * MIN_KNOT_SPACING_S:
-            after = int(np.searchsorted(knots.time_s, instant_s))
+    for instant_s in time_s.tolist():
+        if np.abs(knots.time_s - instant_s).min() > 0.5 * MIN_KNOT_SPACING_S:
+            after = int(knots.time_s.searchsorted(instant_s))
+            before, later = knots.select(slice(after)), knots.select(slice(after, None))
             added = _propagate(knots.select(slice(after - 1, after)), instant_s, prior)
-            knots = concatenate_states([knots.select(slice(after)), added, knots.select(slice(after, None))])
-    return knots
+            knots = concatenate_states([before, added, later] if len(later) else [before, added])
+            steps = ProcessFactors.of(knots.time_s[after - 1 : after + 2], prior)
+            process = ProcessFactors(
+                np.concatenate([process.phi[: after - 1], steps.phi, process.phi[after:]]),
+                np.concatenate(
+                    [process.information[: after - 1], steps.information, process.information[after:]]
+                ),
+            )
+    return knots, process
 
 
 def _propagate(start: States, time_s: float, prior: MotionPrior) -> States:

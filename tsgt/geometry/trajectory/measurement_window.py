@@ -213,6 +213,8 @@ def normalised_innovations(
     for i in range(count):
         block = slice(3 * i, 3 * i + 3)
         nis[i] = innovations[i] @ np.linalg.solve(covariance[block, block], innovations[i])
+    if count == 1:
+        return nis, nis
     sequential_nis, inliers = nis.copy(), np.flatnonzero(nis < OUTLIER_THRESHOLD**2)
     components = (3 * inliers[:, None] + np.arange(3)).ravel()
     try:

@@ -241,11 +241,11 @@ def rotation_between(before: States, after: States) -> FloatArray:
     Below 0.3 rad a whole revolution and none are indistinguishable, and the short way is taken.
     """
     rotvec = fast_log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
-    dt_s = (after.time_s - before.time_s)[:, None]
-    expected = 0.5 * dt_s * (before.angular_velocity + after.angular_velocity)
     angle = np.sqrt(dot(rotvec, rotvec))[:, None]
     if not (angle > _MIN_WRAP_RAD).any():
         return rotvec
+    dt_s = (after.time_s - before.time_s)[:, None]
+    expected = 0.5 * dt_s * (before.angular_velocity + after.angular_velocity)
     complement = rotvec * (1.0 - 2 * np.pi / np.maximum(angle, _MIN_WRAP_RAD))
     error, complement_error = rotvec - expected, complement - expected
     longer = (angle[:, 0] > _MIN_WRAP_RAD) & (dot(complement_error, complement_error) < dot(error, error))

@@ -55,6 +55,26 @@ def test_marginals_are_blocks_of_the_inverse(count: int, size: int) -> None:
 
 
 @pytest.mark.parametrize(("count", "size"), SHAPES)
+def test_addition_to_the_last_block_agrees_with_a_new_factorisation(count: int, size: int) -> None:
+    """The factor that it was made from stays as it is."""
+    diagonal, off_diagonal, _ = random_system(count, size)
+    jacobian = np.random.default_rng(1).normal(size=(3, size))
+    before = factorise(diagonal, off_diagonal)
+    banded = before.banded.copy()
+    found = before.with_last_block_added(jacobian.T @ jacobian)
+    diagonal[-1] += jacobian.T @ jacobian
+    np.testing.assert_allclose(found.banded, factorise(diagonal, off_diagonal).banded, atol=1e-12)
+    np.testing.assert_array_equal(before.banded, banded)
+
+
+def test_negative_addition_to_the_last_block_is_not_determined() -> None:
+    """An error of this package, as from the whole factorisation."""
+    diagonal, off_diagonal, _ = random_system(3, 4)
+    with pytest.raises(GeometryError, match="do not determine"):
+        factorise(diagonal, off_diagonal).with_last_block_added(-1e3 * np.eye(4))
+
+
+@pytest.mark.parametrize(("count", "size"), SHAPES)
 def test_log_determinant_agrees_with_dense(count: int, size: int) -> None:
     """The log determinant equals the dense one."""
     diagonal, off_diagonal, whole = random_system(count, size)

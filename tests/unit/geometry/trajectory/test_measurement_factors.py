@@ -33,6 +33,19 @@ def tumbling(rng: np.random.Generator) -> States:
     )
 
 
+def test_measurements_exactly_at_knots_are_linearised_as_the_others() -> None:
+    """To the last bit, whether or not another measurement is beside its knot."""
+    rng = np.random.default_rng(4)
+    knots = tumbling(rng)
+    measured = observed(knots, rng)
+    knot_index = np.arange(len(measured)) % 2
+    at_knots = replace(measured, time_s=knots.time_s[knot_index])
+    one_beside = replace(measured, time_s=at_knots.time_s + 0.1 * (np.arange(len(measured)) == 0))
+    alone, together = linearise(at_knots, knots, knot_index), linearise(one_beside, knots, knot_index)
+    for name in ("residuals_m", "jacobian", "by_point", "point_m", "velocity_mps", "rotation"):
+        np.testing.assert_array_equal(getattr(alone, name)[1:], getattr(together, name)[1:])
+
+
 def observed(
     knots: States, rng: np.random.Generator, *, count: int = 8, offset_s: float = 0.2
 ) -> Observations:

@@ -180,16 +180,22 @@ class SX127x:
                 raise received
 
     async def close(self) -> None:
-        """Put the chip to sleep and release bus and pins, after the end of a running transmission."""
-        if self._supervisor is not None:
-            self._supervisor.cancel()
-            await asyncio.wait([self._supervisor])
-        async with self._lock:
+        """Put the chip to sleep and release bus and pins, after the end of a running transmission.
+
+        Cancelled, it releases them at once: they can be opened again.
+        """
+        try:
+            if self._supervisor is not None:
+                self._supervisor.cancel()
+                await asyncio.wait([self._supervisor])
+            async with self._lock:
+                if self._state is not State.DOWN:
+                    with suppress(RadioError):  # it is released anyway
+                        self._chip.sleep()
+        finally:
             if self._state is not State.DOWN:
                 self._state = State.DOWN
                 self._problem = "closed"
-                with suppress(RadioError):  # it is released anyway
-                    self._chip.sleep()
             self._hal.close()
 
     async def _set_up(self) -> None:

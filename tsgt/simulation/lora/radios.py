@@ -125,8 +125,10 @@ def radio_opener(
             await radio.start(settings)
             yield radio if host_delay is None else _DelayedRadio(radio, clock, host_delay, rng)
         finally:
-            await radio.close()
-            air.leave(name)
+            try:
+                await radio.close()
+            finally:  # also when the daemon is cancelled while it closes the radio
+                air.leave(name)
 
     return open_radio
 

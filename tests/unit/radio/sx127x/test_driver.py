@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from contextlib import suppress
 from dataclasses import replace
 
 import pytest
@@ -353,6 +354,24 @@ async def test_closed_radio_is_asleep() -> None:
         assert sending.done()
         assert b.here.register(Register.OP_MODE) == 0x80
         assert (await b.there.radio.receive()).payload == b"hello"
+        with pytest.raises(RadioError, match="down: closed"):
+            await b.here.radio.transmit(b"hello")
+
+
+async def test_cancelled_close_releases_the_radio(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A close() that is cancelled while it waits for a transmission releases bus and pins all the same."""
+    async with bench() as b:
+        released: list[bool] = []
+        monkeypatch.setattr(b.here.hal, "close", lambda: released.append(True))
+        sending = asyncio.create_task(b.here.radio.transmit(b"hello"))
+        await asyncio.sleep(0.01)
+        closing = asyncio.create_task(b.here.radio.close())
+        await asyncio.sleep(0.01)
+        closing.cancel()
+        await asyncio.wait([closing])
+        assert released == [True]
+        with suppress(RadioError):
+            await sending
         with pytest.raises(RadioError, match="down: closed"):
             await b.here.radio.transmit(b"hello")
 

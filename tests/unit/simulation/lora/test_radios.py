@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import numpy as np
 import pytest
 from harness.radios import MS, PAPER, running_timeline
@@ -36,6 +38,28 @@ async def test_short_lead_time_delays_the_start() -> None:
     """A host that needs 10 ms to prepare a packet cannot start within 4 ms."""
     late_ms = await _starts_ms(HostDelay(work_ms=10.0, wake_median_ms=0.0), lead_ns=4 * MS)
     assert late_ms == pytest.approx([6.0] * PACKETS, abs=0.1)
+
+
+async def test_radio_whose_closing_is_cancelled_leaves_the_air() -> None:
+    """A daemon that is cancelled while it closes its radio can open it again at once."""
+    clock = VirtualClock(0)
+    air = Air(running_timeline(), np.random.default_rng(0), LinkModel())
+    opener = radio_opener(air, "here", clock, np.random.default_rng(1), PAPER)
+    sending, closes = [], asyncio.Event()
+
+    async def close_during_a_transmission() -> None:
+        async with opener() as radio:
+            sending.append(asyncio.create_task(radio.transmit(b"hello")))
+            await asyncio.sleep(0.01)
+            closes.set()
+
+    closing = asyncio.create_task(close_during_a_transmission())
+    await closes.wait()
+    await asyncio.sleep(0.01)
+    closing.cancel()
+    await asyncio.wait([closing, *sending])
+    async with opener() as radio:
+        await radio.transmit(b"hello")
 
 
 async def test_timestamp_jitter() -> None:

@@ -22,8 +22,8 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
+from tsgt.estimation.poses_ahead import PosesAhead
 from tsgt.estimation.setup_uncertainty import InertialSetupUncertainty, setup_jacobian
-from tsgt.estimation.smoothed_ahead import SmoothedAhead
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
@@ -31,10 +31,13 @@ from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor
     from tsgt.estimation.imu_takeover import ImuState, TrajectoryWindow
+    from tsgt.estimation.pose_output import PoseNumbers
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import States
     from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
@@ -85,9 +88,13 @@ class ContinuousEstimator:
         self._next_epoch_ns: int | None = None
         self._next_smoothed_ns = 0
         self._first_epoch_ns = 0
-        self._ahead = SmoothedAhead(self._limits.period_ns, dim=_POSE_DIM)
+        self._ahead = PosesAhead(self._without_imu, self._poses, self._limits.period_ns)
         # The oldest epoch first. The window still has the states: a delay is below the lag.
-        self._delays_ns = sorted(self._limits.smoothed_delays_ns, reverse=True)
+        self._delays_ns = [*sorted(self._limits.smoothed_delays_ns, reverse=True), 0]
+        # In whole periods
+        self._ages_ns = [
+            -(-each // self._limits.period_ns) * self._limits.period_ns for each in self._delays_ns
+        ]
         self.outside_lag_window: Counter[int] = Counter()
         self._none = PoseBatch.blank(none, tuple(self._columns), Kind.PREDICTED)
 
@@ -150,13 +157,8 @@ class ContinuousEstimator:
             jump_from = self._take_pending(epoch_ns)
             if epoch_ns // SMOOTHING_INTERVAL_NS != (epoch_ns - period_ns) // SMOOTHING_INTERVAL_NS:
                 batches.append(self._smoothed_until(epoch_ns - self._limits.lag_ns))
-            # Epochs up to the next smoothing use the same measurements.
-            next_smoothing_ns = (epoch_ns // SMOOTHING_INTERVAL_NS + 1) * SMOOTHING_INTERVAL_NS
-            due_ns = range(epoch_ns, min(now_ns + 1, next_smoothing_ns), period_ns)
-            if self._imu is not None:
-                due_ns = due_ns[:1]  # the IMU may have fallen silent since
-            batches.append(self._due(due_ns, jump_from))
-            self._next_epoch_ns = due_ns[-1] + period_ns
+            batches.append(self._due(epoch_ns, jump_from))
+            self._next_epoch_ns = epoch_ns + period_ns
         return PoseBatch.concatenated(batches or [self._none])
 
     def next_deadline_ns(self) -> int | None:
@@ -225,72 +227,59 @@ class ContinuousEstimator:
             history.unusable_ns,
         )
 
-    def _due(self, epochs_ns: range, jump_from: States | None) -> PoseBatch:
-        """Return the predicted poses of epochs, each after the smoothed ones whose delay has passed with it."""
-        period_ns = self._limits.period_ns
-        stamps_ns, delays_ns, sent_ns = [], [], []
-        for epoch_ns in epochs_ns:
-            for delay_ns in (*self._delays_ns, 0):
-                stamp_ns = epoch_ns - -(-delay_ns // period_ns) * period_ns
-                if stamp_ns >= self._first_epoch_ns:
-                    stamps_ns.append(stamp_ns)
-                    delays_ns.append(delay_ns)
-                    sent_ns.append(epoch_ns)
-        rows = stamps_ns, delays_ns, sent_ns
-        if not self._window.initialised:
-            return self._with_imu_use(self._poses.due(*rows, self._history, None, _NONE))
-        time_s = (np.array(stamps_ns, dtype=np.int64) - self._origin_ns) / 1e9
-        predicted = np.equal(delays_ns, 0)
-        converged = np.where(
-            predicted,
-            self._window.converged and not self._window.ambiguous,
-            self._converged_at(time_s),
-        )
-        states, covariance, common = self._states_at(stamps_ns, time_s, predicted)
+    def _due(self, epoch_ns: int, jump_from: States | None) -> PoseBatch:
+        """Return the predicted pose of an epoch after the smoothed ones whose delay has passed with it."""
+        # Those of epochs that had a predicted pose
+        count = sum(epoch_ns - age_ns >= self._first_epoch_ns for age_ns in self._ages_ns)
+        ages_ns, delays_ns = self._ages_ns[-count:], self._delays_ns[-count:]
+        stamps_ns = [epoch_ns - age_ns for age_ns in ages_ns]
+        window, time_s = self._window, self._times_s(stamps_ns)
+        numbers: PoseNumbers | None = None
+        jump: tuple[float, float] | None = None
+        if window.initialised:
+            if self._imu is None:
+                numbers = self._ahead.due(epoch_ns, ages_ns, self._origin_ns)
+            else:
+                states, covariance, common = self._states_at(time_s)
+                numbers = self._poses.numbers(states, self._with_allowance(covariance), common)
+                if jump_from is not None:
+                    jump = self._poses.distance(jump_from, states.select(slice(-1, None)))
         batch = self._poses.due(
-            *rows,
+            stamps_ns,
+            delays_ns,
+            epoch_ns,
             self._history,
-            states,
-            self._with_allowance(covariance),
-            common=common,
-            converged=converged,
-            ambiguous=self._window.recently_ambiguous_at(time_s),
+            numbers,
+            converged=[
+                *self._converged_at(time_s[:-1]).tolist(),
+                window.converged and not window.ambiguous,
+            ],
+            ambiguous=window.recently_ambiguous_at(time_s).tolist(),
         )
-        if jump_from is not None:
-            first = int(np.argmax(predicted))
-            batch.jump[first] = self._poses.distance(jump_from, states.select(slice(first, first + 1)))
+        if jump is not None:
+            batch.jump[-1] = jump
         return self._with_imu_use(batch)
 
-    def _states_at(
-        self, stamps_ns: list[int], time_s: FloatArray, predicted: NDArray[np.bool_]
-    ) -> tuple[States, FloatArray, FloatArray | None]:
-        """Return states, their covariance and its common part at epochs that are predicted, or smoothed."""
-        found = [self._window.predict(each_s, dim=_POSE_DIM) for each_s in time_s[predicted].tolist()]
-        common = [self._window.common_at(each_s, dim=_POSE_DIM) for each_s in time_s[predicted].tolist()]
-        if not predicted.all():
-            smoothed = self._smoothed_at(
-                [each for each, is_predicted in zip(stamps_ns, predicted, strict=True) if not is_predicted]
-            )
-            found.append(smoothed[:2])
-            common.append(smoothed[2])
-        known = [each for each in common if each is not None]
-        if len(found) == 1:
-            return *found[0], known[0] if known else None
-        order = np.argsort(np.concatenate([np.flatnonzero(predicted), np.flatnonzero(~predicted)]))
+    def _states_at(self, time_s: FloatArray) -> tuple[States, FloatArray, FloatArray | None]:
+        """Return states, their covariance and its common part at times: smoothed, and at the last one predicted."""
+        states, covariance = self._window.predict(float(time_s[-1]), dim=_POSE_DIM)
+        common = self._window.common_at(float(time_s[-1]), dim=_POSE_DIM)
+        if len(time_s) == 1:
+            return states, covariance, common
+        trajectory = self._window.smoothed_trajectory()
+        smoothed, smoothed_covariance = trajectory.at(time_s[:-1], dim=_POSE_DIM)
+        smoothed_common = trajectory.common_at(time_s[:-1], dim=_POSE_DIM)
+        if common is not None and smoothed_common is not None:
+            common = np.concatenate([smoothed_common, common])
         return (
-            concatenate_states([states for states, _ in found]).select(order),
-            np.concatenate([covariance for _, covariance in found])[order],
-            np.concatenate(known)[order] if known else None,
+            concatenate_states([smoothed, states]),
+            np.concatenate([smoothed_covariance, covariance]),
+            common,
         )
 
-    def _smoothed_at(self, stamps_ns: list[int]) -> tuple[States, FloatArray, FloatArray | None]:
-        """Return smoothed states at epochs, their covariance and its common part."""
-        if self._imu is None:
-            trajectory = self._without_imu.smoothed_trajectory()
-            return self._ahead.at(trajectory, stamps_ns, self._origin_ns)
-        time_s = (np.array(stamps_ns, dtype=np.int64) - self._origin_ns) / 1e9
-        inertial = self._window.smoothed_trajectory()
-        return *inertial.at(time_s, dim=_POSE_DIM), inertial.common_at(time_s, dim=_POSE_DIM)
+    def _times_s(self, stamps_ns: Sequence[int]) -> FloatArray:
+        """(N,) times on the trajectory's scale."""
+        return (np.array(stamps_ns, dtype=np.int64) - self._origin_ns) / 1e9
 
     def _converged_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """Whether the trajectory is reliable at times, (N,), that have been smoothed."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from tsgt.estimation.observations import centroid_m
 from tsgt.estimation.pose_batch import Kind, PoseBatch, Reason
-from tsgt.estimation.pose_quality import degradations, sigma_limits, worst_sigma
-from tsgt.estimation.reference_point import poses_at
+from tsgt.estimation.pose_quality import degradation_of_one, degradations, sigma_limits, worst_sigma
+from tsgt.estimation.reference_point import moved_poses, transform_of
 from tsgt.geometry import log_so3, quaternion_from_rotation
 from tsgt.geometry.trajectory import ros_covariance, state_at_point, with_second_order_terms
 
@@ -78,6 +78,41 @@ class MeasurementHistory:
         return found
 
 
+class PoseNumbers(NamedTuple):
+    """N poses of the reference point from states alone. Which of them are valid depends on the measurements, too."""
+
+    position_m: NDArray[np.float64]  # This and the next five are as in PoseBatch
+    orientation_xyzw: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    covariance_common: NDArray[np.float64]
+    velocity_mps: NDArray[np.float64]
+    angular_velocity_radps: NDArray[np.float64]
+    # (N, 2) of position and rotation in the least certain direction, in m and rad; NaN where rounding made it negative
+    sigmas: NDArray[np.float64]
+    tilt_cosine: NDArray[np.float64]  # (N,)
+
+    def select(self, rows: list[int]) -> PoseNumbers:
+        """Return the poses of some rows."""
+        return PoseNumbers(*(each[rows] for each in self))
+
+    def fill(self, batch: PoseBatch, unknown: NDArray[np.bool_]) -> None:
+        """Copy the poses into a batch, NaN where one is unknown."""
+        for name in self._fields[:6]:
+            array = getattr(batch, name)
+            array[:] = getattr(self, name)
+            if unknown.any():
+                array[unknown] = np.nan
+
+
+class _Verdict(NamedTuple):
+    """Validity of one pose."""
+
+    reason: int  # Of Reason
+    degraded: int  # Of Degradation
+    residual_m: float
+    unknown: bool  # It is not computed
+
+
 class ContinuousPoseOutput:
     """Computes poses and their validity."""
 
@@ -90,44 +125,122 @@ class ContinuousPoseOutput:
         ]
         self._to_origin_m = -centroid_m(parameters)
         self._reference_point = parameters.reference_point
+        self._T_robot_point = transform_of(parameters.reference_point)
+        self._sigma_limits = sigma_limits(np.array(list(Kind), np.int8), self._limits).tolist()
+        self._min_tilt_cosine = math.cos(self._limits.tilt_limit_rad)
         self._undetermined = int(Reason.DEGENERATE_GEOMETRY if parameters.imu is None else Reason.UNCERTAIN)
+
+    def numbers(
+        self, states: States, covariance: NDArray[np.float64], common: NDArray[np.float64] | None = None
+    ) -> PoseNumbers:
+        """Return the poses of states, whatever the measurements; arguments as for :meth:`smoothed`."""
+        rotation = states.rotation
+        if common is None:
+            covariance_common = np.full((len(states), 6, 6), np.nan)
+        else:
+            covariance = covariance[:, :6, :6] + common
+            covariance_common = ros_covariance(rotation, state_at_point(states, common, self._to_origin_m)[1])
+        states, covariance = state_at_point(states, covariance, self._to_origin_m)
+        covariance, sigma_rad = with_second_order_terms(rotation, covariance)
+        poses = moved_poses(
+            self._T_robot_point,
+            states.position,
+            quaternion_from_rotation(rotation),
+            ros_covariance(rotation, covariance),
+            covariance_common,
+            states.velocity,
+            states.angular_velocity,
+            second_order=np.ones(len(states), np.bool_),
+        )
+        sigmas = np.column_stack([worst_sigma(poses[2][:, :3, :3]), sigma_rad])
+        return PoseNumbers(*poses, sigmas, rotation[:, 2, 2])
 
     def due(
         self,
         stamps_ns: Sequence[int],
         delays_ns: Sequence[int],
-        sent_ns: Sequence[int],
+        now_ns: int,
         history: MeasurementHistory,
-        states: States | None,
-        covariance: NDArray[np.float64],
+        numbers: PoseNumbers | None,
         *,
-        common: NDArray[np.float64] | None = None,
-        converged: NDArray[np.bool_] | None = None,
-        ambiguous: NDArray[np.bool_] | None = None,
+        converged: Sequence[bool],
+        ambiguous: Sequence[bool],
     ) -> PoseBatch:
-        """Return the poses that are due live, a few at a time, whose measurements are looked up without arrays.
+        """Return the poses that are due live at an epoch ``now_ns``: a few, whose validity is found without arrays.
 
-        A pose with a delay is one of :meth:`smoothed` that is sent at ``sent_ns``, before it is final: the next measurement
-        of a prism must have arrived by then, unless the last one is within the outage limit, and a pose without any
-        measurement from its epoch on is not computed. One without a delay is predicted from earlier measurements.
+        A pose with a delay is one of :meth:`smoothed` that is sent before it is final: the next measurement of a prism must
+        have arrived, unless the last one is within the outage limit, and a pose without any measurement from its epoch on is
+        not computed. One without a delay is predicted from earlier measurements.
         """
+        newest_ns = int(history.times_ns.max(initial=_NEVER_NS))
+        rows = []
+        for row, (stamp_ns, delay_ns) in enumerate(zip(stamps_ns, delays_ns, strict=True)):
+            kind = Kind.SMOOTHED if delay_ns else Kind.PREDICTED
+            prisms = [
+                self._describe_one(prism, home_station, stamp_ns, now_ns if delay_ns else None)
+                for prism, home_station in zip(history.by_prism, self._home_station, strict=True)
+            ]
+            stations, ages_s, residuals_m, reasons = zip(*prisms, strict=True)
+            verdict = _Verdict(max(reasons) or self._undetermined, 0, math.nan, False)
+            if numbers is not None:
+                verdict = self._verdict(
+                    kind,
+                    (ages_s, residuals_m, reasons),
+                    numbers.sigmas[row].tolist(),
+                    float(numbers.tilt_cosine[row]),
+                    known=not delay_ns or stamp_ns <= newest_ns,
+                    converged=converged[row],
+                    ambiguous=ambiguous[row],
+                )
+            rows.append((int(kind), *verdict, stations, ages_s, residuals_m, reasons))
         batch = PoseBatch.blank(np.array(stamps_ns, dtype=np.int64), self._prisms, Kind.SMOOTHED)
         batch.delay_ns[:] = delays_ns
-        batch.kind[np.equal(batch.delay_ns, 0)] = Kind.PREDICTED
-        for row, (stamp_ns, delay_ns, now_ns) in enumerate(zip(stamps_ns, delays_ns, sent_ns, strict=True)):
-            for column, (prism, home_station) in enumerate(
-                zip(history.by_prism, self._home_station, strict=True)
-            ):
-                (
-                    batch.station[row, column],
-                    batch.age_s[row, column],
-                    batch.prism_residual_m[row, column],
-                    batch.prism_reason[row, column],
-                ) = self._describe_one(prism, home_station, stamp_ns, now_ns if delay_ns else None)
-        known = np.equal(batch.delay_ns, 0) | (batch.stamp_ns <= history.times_ns.max(initial=_NEVER_NS))
-        return self._with_poses(
-            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous, known=known
+        (
+            batch.kind[:],
+            batch.reason[:],
+            batch.degraded[:],
+            batch.residual_m[:],
+            unknown,
+            batch.station[:],
+            batch.age_s[:],
+            batch.prism_residual_m[:],
+            batch.prism_reason[:],
+        ) = zip(*rows, strict=True)
+        if numbers is not None:
+            numbers.fill(batch, np.array(unknown))
+        return replace(batch, reference_point=self._reference_point)
+
+    def _verdict(
+        self,
+        kind: Kind,
+        prisms: tuple[tuple[float, ...], tuple[float, ...], tuple[int, ...]],
+        sigmas: list[float],
+        tilt_cosine: float,
+        *,
+        known: bool,
+        converged: bool,
+        ambiguous: bool,
+    ) -> _Verdict:
+        """Judge one pose as :meth:`_with_poses` does many; ``prisms``: their ages, residuals and reasons."""
+        ages_s, residuals_m, reasons = prisms
+        known = known and sigmas[1] < MAX_ROTATION_SIGMA_RAD
+        residual_m = _root_mean_square(residuals_m) if known else math.nan
+        limits, missing, reason = self._sigma_limits[kind], max(reasons), _VALID
+        if residual_m > self._limits.residual_limit_m:
+            reason = _RESIDUAL
+        elif tilt_cosine <= self._min_tilt_cosine:
+            reason = _TILT
+        elif not converged:
+            reason = _UNCERTAIN
+        # NaN is below no limit.
+        if not (known and sigmas[0] <= limits[0] and sigmas[1] <= limits[1]):
+            reason = missing or (_RESIDUAL if reason == _RESIDUAL else _UNCERTAIN)
+        if reason:
+            return _Verdict(reason, 0, residual_m, not known)
+        degraded = degradation_of_one(
+            kind, ages_s, reasons, residual_m, sigmas, limits, self._limits, ambiguous=ambiguous
         )
+        return _Verdict(_VALID, degraded, residual_m, unknown=False)
 
     def smoothed(
         self,
@@ -163,9 +276,8 @@ class ContinuousPoseOutput:
         batch = PoseBatch.blank(stamp_ns, self._prisms, Kind.SMOOTHED)
         for column in range(len(self._prisms)):
             self._describe(batch, column, history)
-        return self._with_poses(
-            batch, states, covariance, common=common, converged=converged, ambiguous=ambiguous
-        )
+        numbers = None if states is None else self.numbers(states, covariance, common)
+        return self._with_poses(batch, numbers, converged=converged, ambiguous=ambiguous)
 
     def distance(self, before: States, after: States) -> tuple[float, float]:
         """Return the distance of two states' reference points in m, and the rotation between them in rad."""
@@ -239,54 +351,27 @@ class ContinuousPoseOutput:
     def _with_poses(
         self,
         batch: PoseBatch,
-        states: States | None,
-        covariance: NDArray[np.float64],
+        numbers: PoseNumbers | None,
         *,
-        common: NDArray[np.float64] | None = None,
-        converged: NDArray[np.bool_] | None = None,
-        ambiguous: NDArray[np.bool_] | None = None,
-        known: NDArray[np.bool_] | None = None,
+        converged: NDArray[np.bool_] | None,
+        ambiguous: NDArray[np.bool_] | None,
     ) -> PoseBatch:
-        """Fill in the poses that are ``known`` (default: all), and the reasons of invalid ones."""
+        """Fill in the poses, and the reasons of invalid ones."""
         missing = batch.prism_reason.max(axis=1)
-        if states is None:
+        if numbers is None:
             batch.reason[:] = np.where(missing, missing, self._undetermined)
-            return poses_at(batch, self._reference_point)
-        limits, rotation = self._limits, states.rotation
-        if common is not None:
-            covariance = covariance[:, :6, :6] + common
-            batch.covariance_common[:] = ros_covariance(
-                rotation, state_at_point(states, common, self._to_origin_m)[1]
-            )
-        states, covariance = state_at_point(states, covariance, self._to_origin_m)
-        covariance, sigma_rad = with_second_order_terms(rotation, covariance)
-        unknown = ~(sigma_rad < MAX_ROTATION_SIGMA_RAD)
-        if known is not None:
-            unknown |= ~known
-        batch.position_m[:] = states.position
-        batch.orientation_xyzw[:] = quaternion_from_rotation(rotation)
-        batch.covariance[:] = ros_covariance(rotation, covariance)
-        batch.velocity_mps[:] = states.velocity
-        batch.angular_velocity_radps[:] = states.angular_velocity
+            return replace(batch, reference_point=self._reference_point)
+        limits = self._limits
+        unknown = ~(numbers.sigmas[:, 1] < MAX_ROTATION_SIGMA_RAD)
+        numbers.fill(batch, unknown)
         fitted = np.isfinite(batch.prism_residual_m)
         squares = np.where(fitted, batch.prism_residual_m, 0.0) ** 2
         count = fitted.sum(axis=1)
-        batch.residual_m[:] = np.where(count, np.sqrt(squares.sum(axis=1) / np.maximum(count, 1)), np.nan)
-        if unknown.any():
-            for numbers in (
-                batch.position_m,
-                batch.orientation_xyzw,
-                batch.covariance,
-                batch.covariance_common,
-            ):
-                numbers[unknown] = np.nan
-            for numbers in (batch.velocity_mps, batch.angular_velocity_radps, batch.residual_m):
-                numbers[unknown] = np.nan
-        batch = poses_at(batch, self._reference_point)
-        sigmas = np.column_stack([worst_sigma(batch.covariance[:, :3, :3]), sigma_rad])
+        residual_m = np.sqrt(squares.sum(axis=1) / np.maximum(count, 1))
+        batch.residual_m[:] = np.where((count > 0) & ~unknown, residual_m, np.nan)
         # Rounding may make a variance negative; its sigma is NaN, which is below no limit.
-        uncertain = unknown | ~(sigmas <= sigma_limits(batch.kind, limits)).all(axis=1)
-        batch.reason[rotation[:, 2, 2] <= math.cos(limits.tilt_limit_rad)] = _TILT
+        uncertain = unknown | ~(numbers.sigmas <= sigma_limits(batch.kind, limits)).all(axis=1)
+        batch.reason[numbers.tilt_cosine <= self._min_tilt_cosine] = _TILT
         batch.reason[batch.residual_m > limits.residual_limit_m] = _RESIDUAL
         if converged is not None:
             batch.reason[~converged & (batch.reason == _VALID)] = _UNCERTAIN
@@ -294,5 +379,11 @@ class ContinuousPoseOutput:
             # A wrong layout makes poses uncertain too: its outliers have little weight.
             present = np.where(batch.reason == _RESIDUAL, _RESIDUAL, _UNCERTAIN)
             batch.reason[uncertain] = np.where(missing, missing, present)[uncertain]
-        batch.degraded[:] = degradations(batch, sigmas, limits, ambiguous=ambiguous)
-        return batch
+        batch.degraded[:] = degradations(batch, numbers.sigmas, limits, ambiguous=ambiguous)
+        return replace(batch, reference_point=self._reference_point)
+
+
+def _root_mean_square(residuals_m: tuple[float, ...]) -> float:
+    """Of those that are known; NaN without any."""
+    squares = [each * each for each in residuals_m if not math.isnan(each)]
+    return math.sqrt(sum(squares) / len(squares)) if squares else math.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,8 @@ from tsgt.estimation.pose_batch import Degradation, Kind, Reason
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from tsgt.estimation.pose_batch import PoseBatch
@@ -23,6 +26,19 @@ invalid.
 OLD_SHARE = 0.75
 """Share of the outage limit. With measurements of three prisms in each frame of the radio, 99 of 100 predictions rest on one
 that is less than 0.62 s old."""
+
+_VALID = int(Reason.VALID)
+# Plain numbers: operators of flags take microseconds
+_PRISM_MISSING, _OLD_MEASUREMENTS, _UNCERTAIN, _AMBIGUOUS, _RESIDUAL = (
+    int(each)
+    for each in (
+        Degradation.PRISM_MISSING,
+        Degradation.OLD_MEASUREMENTS,
+        Degradation.UNCERTAIN,
+        Degradation.AMBIGUOUS,
+        Degradation.RESIDUAL,
+    )
+)
 
 
 def worst_sigma(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -83,4 +99,34 @@ def degradations(
         found[ambiguous] |= Degradation.AMBIGUOUS
     found[batch.residual_m > DEGRADED_SHARE * limits.residual_limit_m] |= Degradation.RESIDUAL
     found[~batch.valid] = 0
+    return found
+
+
+def degradation_of_one(
+    kind: Kind,
+    ages_s: Sequence[float],
+    prism_reasons: Sequence[int],
+    residual_m: float,
+    sigmas: Sequence[float],
+    sigma_limits_of_kind: Sequence[float],
+    limits: PipelineParameters,
+    *,
+    ambiguous: bool,
+) -> int:
+    """Return what degrades one valid pose, as :func:`degradations`: for a single pose in a tenth of its time.
+
+    ``ages_s``, ``prism_reasons``: by prism. ``sigmas``, ``sigma_limits_of_kind``: of position and rotation, in m and rad.
+    """
+    found = 0
+    if prism_reasons.count(_VALID) < min(MIN_PRISMS, len(prism_reasons)):
+        found |= _PRISM_MISSING
+    newest_age_s = min((each for each in ages_s if not math.isnan(each)), default=math.nan)
+    if kind == Kind.PREDICTED and newest_age_s > OLD_SHARE * limits.outage_limit_ns / 1e9:
+        found |= _OLD_MEASUREMENTS
+    if any(sigma > DEGRADED_SHARE * limit for sigma, limit in zip(sigmas, sigma_limits_of_kind, strict=True)):
+        found |= _UNCERTAIN
+    if ambiguous:
+        found |= _AMBIGUOUS
+    if residual_m > DEGRADED_SHARE * limits.residual_limit_m:
+        found |= _RESIDUAL
     return found

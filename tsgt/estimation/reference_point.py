@@ -89,18 +89,41 @@ def poses_at(batch: PoseBatch, point: ReferencePoint) -> PoseBatch:
         return batch
     T = transform_between(batch.reference_point, point)
     rows = np.flatnonzero(np.isfinite(batch.position_m[:, 0]))
-    if not len(rows) or np.array_equal(T, np.eye(4)):
+    if not len(rows):
         return dataclasses.replace(batch, reference_point=point)
-    names = ("position_m", "orientation_xyzw", "velocity_mps", "angular_velocity_radps")
-    arm_m, motion = _motion_at(T, *(getattr(batch, name)[rows] for name in names))
-    found = dict(zip(names, motion, strict=True))
-    continuous = batch.kind[rows] != Kind.INTERPOLATED
-    found["covariance"] = _covariance_at(batch.covariance[rows], arm_m, continuous)
-    found["covariance_common"] = covariance_over_lever_arm(batch.covariance_common[rows], arm_m)
-    moved = {name: getattr(batch, name).copy() for name in found}
-    for name, values in found.items():
+    names = (
+        *("position_m", "orientation_xyzw", "covariance", "covariance_common"),
+        *("velocity_mps", "angular_velocity_radps"),
+    )
+    second_order = batch.kind[rows] != Kind.INTERPOLATED
+    found = moved_poses(T, *(getattr(batch, name)[rows] for name in names), second_order=second_order)
+    moved = {name: getattr(batch, name).copy() for name in names}
+    for name, values in zip(names, found, strict=True):
         moved[name][rows] = values
     return dataclasses.replace(batch, reference_point=point, **moved)
+
+
+def moved_poses(
+    T: FloatArray,
+    position: FloatArray,
+    orientation: FloatArray,
+    covariance: FloatArray,
+    covariance_common: FloatArray,
+    velocity: FloatArray,
+    rate: FloatArray,
+    *,
+    second_order: NDArray[np.bool_],
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return poses of frame a as those of frame b, in the order of the arguments, by ``T_a_b``.
+
+    ``second_order``: (N,) whether ``covariance`` contains second-order terms, which depend on the point.
+    """
+    if np.array_equal(T, np.eye(4)):
+        return position, orientation, covariance, covariance_common, velocity, rate
+    arm_m, (position, orientation, velocity, rate) = _motion_at(T, position, orientation, velocity, rate)
+    covariance = _covariance_at(covariance, arm_m, second_order)
+    covariance_common = covariance_over_lever_arm(covariance_common, arm_m)
+    return position, orientation, covariance, covariance_common, velocity, rate
 
 
 def records_at(records: Iterable[PoseRecord], a: ReferencePoint, b: ReferencePoint) -> Iterator[PoseRecord]:

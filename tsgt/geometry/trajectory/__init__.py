@@ -4,7 +4,7 @@ States, factors and the Gauss-Newton solver that all estimators share; :class:`F
 ``geometry.batch`` fits whole recordings. docs/explanation/continuous-trajectory.md derives the equations.
 """
 
-from tsgt.geometry.trajectory.fixed_lag import FixedLagSmoother
+from tsgt.geometry.trajectory.fixed_lag import FixedLagSmoother, Predictions
 from tsgt.geometry.trajectory.gauss_newton import (
     MIN_KNOT_SPACING_S,
     Solution,
@@ -31,6 +31,7 @@ __all__ = [
     "FixedLagSmoother",
     "LinearisedMeasurements",
     "Observations",
+    "Predictions",
     "SetupJacobian",
     "Solution",
     "States",

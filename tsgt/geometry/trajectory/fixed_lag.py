@@ -7,7 +7,7 @@ uncertainty: a large residual may also be a manoeuvre. See docs/explanation/cont
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -64,12 +64,22 @@ millimetres. Larger ones would be lost to rounding against the stiff process fac
 """
 
 
+class Predictions(NamedTuple):
+    """States at N times, predicted from measurements before, or between them."""
+
+    states: States
+    covariance: FloatArray  # (N, dim, dim) of the leading components of their errors
+    by_prior: FloatArray  # The same without the scales that follow from earlier errors
+    comparable: list[bool]  # Whether the error of each will count for later predictions
+
+
 class FixedLagSmoother(MeasurementWindow):
     """Estimates the trajectory of a robot online, from the measurements of the window and the motion prior.
 
     ``reliable_from_s``: each of three prisms must have been measured twice; after one or two measurements of each, the robot
     may lie the other way about the line through two prisms, which later measurements do not resolve for times before a gap; and
-    the first measurement, with nothing to contradict it, may be of a wrong prism.
+    the first measurement, with nothing to contradict it, may be of a wrong prism. ``revision``: while it stays the same, so do
+    all states and predictions.
     """
 
     def __init__(self, prior: MotionPrior, setup_jacobian: SetupJacobian | None = None) -> None:
@@ -85,6 +95,7 @@ class FixedLagSmoother(MeasurementWindow):
         self._smoothed: Trajectory | None = None
         self._propagator: Propagator | None = None
         self._prediction_errors = PredictionErrorMonitor()
+        self.revision = 0
 
     @property
     def initialised(self) -> bool:
@@ -94,11 +105,13 @@ class FixedLagSmoother(MeasurementWindow):
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
         self._rest.add(new)
+        self.revision += 1
         self._smoothed = None
         super().update(new)
 
     def marginalise_before(self, before_s: float) -> None:
         """Marginalise the states before a time; states from then on can still be queried."""
+        self.revision += 1
         self._smoothed = None
         if self.observations is not None:
             if self._converged:
@@ -153,17 +166,48 @@ class FixedLagSmoother(MeasurementWindow):
     def predict(self, time_s: float, *, dim: int = STATE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all measurements so far, with its covariance as :meth:`Trajectory.at` does.
 
+        See :meth:`predictions`; its error counts for later ones.
+        """
+        found = self.predictions(np.array([time_s]), dim=dim)
+        self.record(found, 0)
+        return found.states, found.covariance
+
+    def predictions(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> Predictions:
+        """Return states at N times in their order, given all measurements so far.
+
         Beyond the last measurement :data:`PREDICTION_NOISE_SCALE` scales the process noise, the newest NIS the covariance
         and, while three prisms are observed, the errors of earlier predictions that of each axis.
         """
         assert self._propagator is not None  # noqa: S101 (only called while initialised)
-        if time_s >= self._propagator.time_s:
-            state, covariance = self._propagator.at(time_s, dim=dim)
-            if self._converged and not self.ambiguous and self._observed_prisms(time_s) >= MIN_PRISMS:
-                self._prediction_errors.record(state, covariance)
-                covariance = self._prediction_errors.scaled(covariance)
-            return state, covariance * self._prediction_scale()
-        return self.trajectory().at(np.array([time_s]), dim=dim)
+        inside = int(time_s.searchsorted(self._propagator.time_s))
+        if inside:
+            states, covariance = self.trajectory().at(time_s[:inside], dim=dim)
+            found = Predictions(states, covariance, covariance, [False] * inside)
+            if inside == len(time_s):
+                return found
+            beyond = self.predictions(time_s[inside:], dim=dim)
+            return Predictions(
+                concatenate_states([states, beyond.states]),
+                np.concatenate([covariance, beyond.covariance]),
+                np.concatenate([covariance, beyond.by_prior]),
+                [*found.comparable, *beyond.comparable],
+            )
+        states, by_prior = self._propagator.at_times(time_s, dim=dim)
+        tracked = self._converged and not self.ambiguous
+        comparable = [tracked and self._observed_prisms(each_s) >= MIN_PRISMS for each_s in time_s.tolist()]
+        covariance = by_prior
+        if any(comparable):
+            scaled = self._prediction_errors.scaled(by_prior)
+            covariance = (
+                scaled if all(comparable) else np.where(np.array(comparable)[:, None, None], scaled, by_prior)
+            )
+        return Predictions(states, covariance * self._prediction_scale(), by_prior, comparable)
+
+    def record(self, predictions: Predictions, row: int) -> None:
+        """Compare a prediction with the trajectory later: its error counts for later predictions."""
+        if predictions.comparable[row]:
+            only = slice(row, row + 1)
+            self._prediction_errors.record(predictions.states.select(only), predictions.by_prior[only])
 
     def _observed_prisms(self, time_s: float) -> int:
         """Count the prisms measured shortly before a time."""
@@ -202,16 +246,21 @@ class FixedLagSmoother(MeasurementWindow):
 
     def common_at(self, time_s: float, *, dim: int = STATE_DIM) -> FloatArray | None:
         """Return the (1, dim, dim) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""
+        return self.predictions_common(np.array([time_s]), dim=dim)
+
+    def predictions_common(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> FloatArray | None:
+        """Return the (N, dim, dim) covariance that the set-up's uncertainty adds to :meth:`predictions`; None: unknown."""
         if self._common is None:
             return None
         assert self._solved is not None  # noqa: S101 (only called while initialised)
         assert self._propagator is not None  # noqa: S101 (only called while initialised)
-        if time_s < self._propagator.time_s:
-            return self.trajectory().common_at(np.array([time_s]), dim=dim)
-        newest = self._common.of_window(*self._solved)[-1]
-        displacement = self._propagator.by_start(time_s)[:dim] @ newest
-        covariance: FloatArray = (displacement @ displacement.T)[None]
-        return covariance
+        inside = int(time_s.searchsorted(self._propagator.time_s))
+        parts = [self.trajectory().common_at(time_s[:inside], dim=dim)] if inside else []
+        if inside < len(time_s):
+            newest = self._common.of_window(*self._solved)[-1]
+            displacement = self._propagator.by_start_at_times(time_s[inside:])[:, :dim] @ newest
+            parts.append(displacement @ np.swapaxes(displacement, 1, 2))
+        return np.concatenate([each for each in parts if each is not None])
 
     def _initialise(self, observations: Observations) -> None:
         self._converged, self._newest_nis = False, 0.0

@@ -7,6 +7,7 @@ steer after minutes of steady driving; their covariance stays that of the motion
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -49,11 +50,12 @@ class PredictionErrorMonitor:
     def record(self, state: States, covariance: FloatArray) -> None:
         """Keep a prediction with its unscaled covariance, (1, N, N), to compare it later."""
         time_s = float(state.time_s[0])
-        moves = (
-            np.linalg.norm(state.velocity[0]) > MIN_SPEED_MPS
-            or np.linalg.norm(state.angular_velocity[0]) > MIN_RATE_RADPS
-        )
-        if moves and time_s - self._recorded_s >= INTERVAL_S:
+        if time_s - self._recorded_s < INTERVAL_S:
+            return
+        if (
+            math.hypot(*state.velocity[0].tolist()) > MIN_SPEED_MPS
+            or math.hypot(*state.angular_velocity[0].tolist()) > MIN_RATE_RADPS
+        ):
             self._recorded_s = time_s
             self._pending.append((state, np.diagonal(covariance[0])[_AXES]))
 

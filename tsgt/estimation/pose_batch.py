@@ -92,6 +92,12 @@ class Kind(IntEnum):
 
 
 _RECORDS_AT_ONCE = 1024
+# Looked up by value: a property of a member takes microseconds
+_REASON_WORDS = [reason.word for reason in Reason]
+_KIND_WORDS = [kind.word for kind in Kind]
+_ESTIMATORS = [kind.estimator for kind in Kind]
+_USE_WORDS = [use.word for use in ImuUse]
+_VALID = int(Reason.VALID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,8 +217,6 @@ class PoseBatch:
         if not len(self):
             return
         computed = np.isfinite(self.position_m[:, 0])
-        reasons, kinds = [reason.word for reason in Reason], [kind.word for kind in Kind]
-        uses = [use.word for use in ImuUse]
         # One conversion to Python numbers per array, not per element.
         rows = zip(
             self.stamp_ns.tolist(),
@@ -249,14 +253,14 @@ class PoseBatch:
                 covariance_common=common,
                 velocity_mps=velocity,
                 angular_velocity_radps=angular_velocity,
-                estimator=Kind(kind).estimator,
-                kind=kinds[kind],
+                estimator=_ESTIMATORS[kind],
+                kind=_KIND_WORDS[kind],
                 delay_s=delay / 1e9 if delay else None,
-                imu=uses[imu],
+                imu=_USE_WORDS[imu],
                 jump_m=None if math.isnan(jump[0]) else jump[0],
                 jump_rad=None if math.isnan(jump[0]) else jump[1],
-                valid=reason == Reason.VALID,
-                reason=reasons[reason],
+                valid=reason == _VALID,
+                reason=_REASON_WORDS[reason],
                 quality="invalid" if reason else "degraded" if degraded else "good",
                 degraded_by=degradation_words(degraded),
                 residual_m=None if math.isnan(residual) else residual,
@@ -264,7 +268,6 @@ class PoseBatch:
             )
 
     def _shares(self) -> Iterable[tuple[stream_records.StationShare, ...]]:
-        words = [reason.word for reason in Reason]
         columns = (self.station, self.age_s, self.prism_residual_m, self.prism_reason)
         for stations, ages, residuals, reasons in zip(*(c.tolist() for c in columns), strict=True):
             yield tuple(
@@ -273,7 +276,7 @@ class PoseBatch:
                     prism=prism,
                     age_s=None if math.isnan(age) else age,
                     residual_m=None if math.isnan(residual) else residual,
-                    reason=words[reason],
+                    reason=_REASON_WORDS[reason],
                 )
                 for station, prism, age, residual, reason in zip(
                     stations, self.prisms, ages, residuals, reasons, strict=True

@@ -95,13 +95,18 @@ class PoseNumbers(NamedTuple):
         """Return the poses of some rows."""
         return PoseNumbers(*(each[rows] for each in self))
 
-    def fill(self, batch: PoseBatch, unknown: NDArray[np.bool_]) -> None:
-        """Copy the poses into a batch, NaN where one is unknown."""
-        for name in self._fields[:6]:
-            array = getattr(batch, name)
-            array[:] = getattr(self, name)
-            if unknown.any():
-                array[unknown] = np.nan
+    def without(self, unknown: NDArray[np.bool_] | list[bool]) -> PoseNumbers:
+        """Return these with NaN where a pose, (N,), is unknown."""
+        copies = PoseNumbers(*(each.copy() for each in self))
+        for each in copies[:6]:
+            each[unknown] = np.nan
+        return copies
+
+    @classmethod
+    def none(cls, count: int) -> PoseNumbers:
+        """Return N poses of which nothing is known."""
+        shapes = (3,), (4,), (6, 6), (6, 6), (3,), (3,), (2,), ()
+        return cls(*(np.full((count, *shape), np.nan) for shape in shapes))
 
 
 class _Verdict(NamedTuple):
@@ -193,22 +198,36 @@ class ContinuousPoseOutput:
                     ambiguous=ambiguous[row],
                 )
             rows.append((int(kind), *verdict, stations, ages_s, residuals_m, reasons))
-        batch = PoseBatch.blank(np.array(stamps_ns, dtype=np.int64), self._prisms, Kind.SMOOTHED)
-        batch.delay_ns[:] = delays_ns
-        (
-            batch.kind[:],
-            batch.reason[:],
-            batch.degraded[:],
-            batch.residual_m[:],
-            unknown,
-            batch.station[:],
-            batch.age_s[:],
-            batch.prism_residual_m[:],
-            batch.prism_reason[:],
-        ) = zip(*rows, strict=True)
-        if numbers is not None:
-            numbers.fill(batch, np.array(unknown))
-        return replace(batch, reference_point=self._reference_point)
+        kinds, reasons, degraded, residual_m, unknown, stations, ages_s, residuals_m, prism_reasons = zip(
+            *rows, strict=True
+        )
+        count = len(rows)
+        if numbers is None:
+            numbers = PoseNumbers.none(count)
+        elif any(unknown):
+            numbers = numbers.without(list(unknown))
+        return PoseBatch(
+            stamp_ns=np.array(stamps_ns, dtype=np.int64),
+            kind=np.array(kinds, np.int8),
+            delay_ns=np.array(delays_ns, dtype=np.int64),
+            reason=np.array(reasons, np.int8),
+            degraded=np.array(degraded, np.int8),
+            position_m=numbers.position_m,
+            orientation_xyzw=numbers.orientation_xyzw,
+            covariance=numbers.covariance,
+            covariance_common=numbers.covariance_common,
+            velocity_mps=numbers.velocity_mps,
+            angular_velocity_radps=numbers.angular_velocity_radps,
+            residual_m=np.array(residual_m),
+            station=np.array(stations, np.int64),
+            age_s=np.array(ages_s),
+            prism_residual_m=np.array(residuals_m),
+            prism_reason=np.array(prism_reasons, np.int8),
+            imu=np.zeros(count, np.int8),
+            jump=np.full((count, 2), np.nan),
+            prisms=self._prisms,
+            reference_point=self._reference_point,
+        )
 
     def _verdict(
         self,
@@ -283,7 +302,7 @@ class ContinuousPoseOutput:
         """Return the distance of two states' reference points in m, and the rotation between them in rad."""
         lever_arm = self._to_origin_m + np.array(self._reference_point.position_m)
         moved = after.position + after.rotation @ lever_arm - before.position - before.rotation @ lever_arm
-        turned = log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
+        turned = log_so3(before.rotation.swapaxes(1, 2) @ after.rotation)
         return float(np.linalg.norm(moved)), float(np.linalg.norm(turned))
 
     def _describe_one(
@@ -363,7 +382,9 @@ class ContinuousPoseOutput:
             return replace(batch, reference_point=self._reference_point)
         limits = self._limits
         unknown = ~(numbers.sigmas[:, 1] < MAX_ROTATION_SIGMA_RAD)
-        numbers.fill(batch, unknown)
+        known = numbers.without(unknown)
+        for name in PoseNumbers._fields[:6]:
+            getattr(batch, name)[:] = getattr(known, name)
         fitted = np.isfinite(batch.prism_residual_m)
         squares = np.where(fitted, batch.prism_residual_m, 0.0) ** 2
         count = fitted.sum(axis=1)

@@ -70,13 +70,13 @@ class BlockCholesky:
         next_block: FloatArray | None = None
         for start in range((count - 1) // _BLOCKS_PER_CHUNK * _BLOCKS_PER_CHUNK, -1, -_BLOCKS_PER_CHUNK):
             inverse, sub_diagonal = _inverse_and_sub_diagonal(columns[start : start + _BLOCKS_PER_CHUNK])
-            own, gain = np.swapaxes(inverse, 1, 2) @ inverse, np.swapaxes(-sub_diagonal @ inverse, 1, 2)
+            own, gain = inverse.swapaxes(1, 2) @ inverse, np.swapaxes(-sub_diagonal @ inverse, 1, 2)
             for k in range(len(own) - 1, -1, -1):
                 if next_block is not None:
                     cross = np.dot(gain[k], next_block, out=off_diagonal[start + k])
                     own[k] += np.dot(cross, gain[k].T)
                 next_block = own[k]
-            diagonal[start : start + len(own)] = 0.5 * (own + np.swapaxes(own, 1, 2))
+            diagonal[start : start + len(own)] = 0.5 * (own + own.swapaxes(1, 2))
         return diagonal, off_diagonal
 
 
@@ -109,7 +109,7 @@ def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
     # LAPACK's band storage is column by column, each from the diagonal down: a column of both blocks, one below the other, and
     # zeros, from its own number on.
     full = np.zeros((count, size, 3 * size))
-    full[:, :, :size] = np.swapaxes(diagonal, 1, 2)
+    full[:, :, :size] = diagonal.swapaxes(1, 2)
     full[:-1, :, size : 2 * size] = off_diagonal
     of_block, of_column, of_row = full.strides
     columns = np.lib.stride_tricks.as_strided(

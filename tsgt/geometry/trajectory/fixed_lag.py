@@ -259,7 +259,7 @@ class FixedLagSmoother(MeasurementWindow):
         if inside < len(time_s):
             newest = self._common.of_window(*self._solved)[-1]
             displacement = self._propagator.by_start_at_times(time_s[inside:])[:, :dim] @ newest
-            parts.append(displacement @ np.swapaxes(displacement, 1, 2))
+            parts.append(displacement @ displacement.swapaxes(1, 2))
         return np.concatenate([each for each in parts if each is not None])
 
     def _initialise(self, observations: Observations) -> None:

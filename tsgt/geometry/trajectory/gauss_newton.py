@@ -302,9 +302,12 @@ def robust_loss(
     """Weights and losses of M measurements from their squared Mahalanobis distances; masks as for :func:`assemble`."""
     ratio = np.maximum(squared_distances / OUTLIER_THRESHOLD**2, 1.0)
     weights = 1.0 / ratio
-    loss = np.minimum(squared_distances, OUTLIER_THRESHOLD**2) + OUTLIER_THRESHOLD**2 * np.log(ratio)
+    loss = np.minimum(squared_distances, OUTLIER_THRESHOLD**2)
+    has_outliers = bool((ratio > 1.0).any())
+    if has_outliers:
+        loss += OUTLIER_THRESHOLD**2 * np.log(ratio)
     # Where most measurements are outliers the trajectory or the set-up is wrong, not the measurements.
-    if rejectable is not None and 2 * np.count_nonzero(ratio == 1.0) > len(ratio):
+    if has_outliers and rejectable is not None and 2 * np.count_nonzero(ratio == 1.0) > len(ratio):
         rejected = rejectable & (squared_distances > REJECTION_THRESHOLD**2)
         weights[rejected] = 0.0
         loss[rejected] = OUTLIER_THRESHOLD**2 * (
@@ -324,6 +327,12 @@ def add_measurements(
 ) -> None:
     """Add measurements, whitened, (M, 3, B + 1), and weighted, (M,), to the normal equations of blocks of B, in place."""
     size = diagonal.shape[-1]
+    if len(knot_index) <= _MEASUREMENTS_PER_CHUNK and (knot_index[1:] > knot_index[:-1]).all():
+        # Most windows of a fixed lag: one measurement of each knot, in their order.
+        normal = (whitened * weights[:, None, None]).swapaxes(1, 2) @ whitened
+        diagonal[knot_index] += normal[:, :size, :size]
+        gradient[knot_index] += normal[:, :size, size]
+        return
     order = np.argsort(knot_index, kind="stable")
     for start in range(0, len(knot_index), _MEASUREMENTS_PER_CHUNK):
         chunk = order[start : start + _MEASUREMENTS_PER_CHUNK]

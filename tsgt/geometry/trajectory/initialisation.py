@@ -67,7 +67,7 @@ class PrismTracks:
         rotation = _interpolate_rotation(time_s, time_s[valid], poses.rotation[valid])
         # The tracked prisms, if any, determine the position.
         weights = np.where(tracked.any(axis=1, keepdims=True), tracked, 1.0)[..., None]
-        reference_points = tracks - self.layout @ np.swapaxes(rotation, 1, 2)
+        reference_points = tracks - self.layout @ rotation.swapaxes(1, 2)
         position = (weights * reference_points).sum(axis=1) / weights.sum(axis=1)
         zero = np.zeros_like(position)
         velocity = np.gradient(position, time_s, axis=0) if len(time_s) > 1 else zero

@@ -115,7 +115,7 @@ def linearise(
     by_rotation = -by_point @ rotation @ skew(lever_arm)
     by_delta_rotation = by_rotation @ J_r
     jacobian[:, :, 0:3] = by_point
-    jacobian[:, :, 3:6] = by_rotation @ np.swapaxes(delta_R, 1, 2)
+    jacobian[:, :, 3:6] = by_rotation @ delta_R.swapaxes(1, 2)
     jacobian[:, :, 6:9] = by_point * delta_s[:, None]
     jacobian[:, :, 9:12] = by_delta_rotation * delta_s[:, None]
     jacobian[:, :, 12:15] = by_point * half_delta_s2[:, None]
@@ -140,7 +140,7 @@ def _linearise_at_knots(
 def _residuals_by_point(observations: Observations, point: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals of predicted points in frame ``station1``, (M, 3), and their Jacobians by the points, (M, 3, 3)."""
     frames = observations.frames[observations.station]
-    to_station = np.swapaxes(frames[:, :3, :3], 1, 2)
+    to_station = frames[:, :3, :3].swapaxes(1, 2)
     predicted = matvec(to_station, point - frames[:, :3, 3])
     measured = observations.points_m
     residuals = predicted - measured

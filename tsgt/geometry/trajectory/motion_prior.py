@@ -89,13 +89,15 @@ def interpolation_weights(
     Returns (..., 3, 3) each: the mean is ``from_earlier @ x_earlier + from_later @ x_later``, and ``conditional`` is
     the covariance given both states, for unit acceleration sigma.
     """
-    dts_s = np.stack([before_s, after_s, before_s + after_s])
-    q = process_noise(before_s, time_s)
-    phi, phi_after, phi_step = transition(dts_s, time_s)
-    gain = q @ np.swapaxes(phi_after, -1, -2) @ process_information(dts_s[2], time_s)
+    dts_s = np.stack([before_s, before_s + after_s, after_s])
+    phi, phi_step, phi_after = transition(dts_s, time_s)
+    noise, step_noise = _unit_step_noise(dts_s[:2] / time_s)
+    q = _scale_by_dt(noise, dts_s[0])
+    step_information = _scale_by_dt(np.linalg.inv(step_noise), 1.0 / dts_s[1])
+    gain = q @ phi_after.swapaxes(-1, -2) @ step_information
     from_earlier = phi - gain @ phi_step
     conditional = q - gain @ phi_after @ q
-    return from_earlier, gain, 0.5 * (conditional + np.swapaxes(conditional, -1, -2))
+    return from_earlier, gain, 0.5 * (conditional + conditional.swapaxes(-1, -2))
 
 
 def _impulse_response(s: FloatArray) -> FloatArray:
@@ -124,7 +126,7 @@ def _unit_step_noise(s: FloatArray) -> FloatArray:
 def _quadrature_noise(s: FloatArray) -> FloatArray:
     # Response to an impulse at the fraction 1 - node of the step.
     response = _impulse_response(s[..., None] * _NODES) * _WEIGHTED_NODES
-    q: FloatArray = 2.0 * s[..., None, None] * (np.swapaxes(response, -1, -2) @ response)
+    q: FloatArray = 2.0 * s[..., None, None] * (response.swapaxes(-1, -2) @ response)
     return q
 
 

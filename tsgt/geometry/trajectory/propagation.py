@@ -70,9 +70,9 @@ class Propagator:
         by_axis = np.repeat(_process_noise(time_s - self.time_s, self._times_s), 3, axis=1)
         by_axis *= self._variances[:, None, None]
         np.einsum("niaja->naij", noise.reshape(-1, 3, 6, 3, 6))[...] = by_axis
-        covariance = by_start @ self._covariance @ np.swapaxes(by_start, 1, 2)
-        covariance += by_noise @ noise @ np.swapaxes(by_noise, 1, 2)
-        return states, 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
+        covariance = by_start @ self._covariance @ by_start.swapaxes(1, 2)
+        covariance += by_noise @ noise @ by_noise.swapaxes(1, 2)
+        return states, 0.5 * (covariance + covariance.swapaxes(1, 2))
 
     def by_start_at_times(self, time_s: FloatArray) -> FloatArray:
         """(N, 18, 18) Jacobian of the errors at N times, none before the start, by the error at the start."""
@@ -125,7 +125,7 @@ class Propagator:
         _set_diagonal(by_start, 6, 12, linear_1, angular_1)
         _set_diagonal(by_start, 12, 12, linear_2, angular_2)
         by_rate, by_rate_here = (J_r @ skew(magnus * np.array(each)) for each in (rate, rates_here))
-        by_start[:, 3:6, 3:6] = np.swapaxes(delta_R, 1, 2)
+        by_start[:, 3:6, 3:6] = delta_R.swapaxes(1, 2)
         by_start[:, 3:6, 9:12] = J_r * dt[:, :, None] + by_rate - by_rate_here
         by_start[:, 3:6, 15:18] = J_r * angular_0[:, :, None] + by_rate * angular_1[:, :, None]
         by_noise[:, 3:6, 3:6] = J_r

@@ -116,68 +116,62 @@ class Trajectory:
         to_error = _linear_to_error(J_r, magnus, rate)
         by_start = to_error @ axes_to_state(phi)
         by_start[:, 3:6, 9:12] -= J_r @ (magnus[..., None] * skew(rate_here))
-        by_start[:, 3:6, 3:6] = np.swapaxes(delta_R, 1, 2)
+        by_start[:, 3:6, 3:6] = delta_R.swapaxes(1, 2)
         by_start, to_error = by_start[:, :dim], to_error[:, :dim]
-        covariance = by_start @ self.covariance[knot] @ np.swapaxes(by_start, 1, 2)
-        return states, _symmetric(covariance + to_error @ axes_to_state(noise) @ np.swapaxes(to_error, 1, 2))
+        covariance = by_start @ self.covariance[knot] @ by_start.swapaxes(1, 2)
+        return states, _symmetric(covariance + to_error @ axes_to_state(noise) @ to_error.swapaxes(1, 2))
 
     def _interpolate(self, time_s: FloatArray, later: np.ndarray, dim: int) -> tuple[States, FloatArray]:
-        before, after = self.knots.select(later - 1), self.knots.select(later)
+        count = len(time_s)
+        # Calls of numpy cost more than their arithmetic here: both knots of each interval, and both weights, go together.
+        both = self.knots.select(np.concatenate([later - 1, later]))
+        before, after = both.select(slice(count)), both.select(slice(count, None))
         dt_s, step_s = time_s - before.time_s, after.time_s - before.time_s
         # Linear and angular weights, each for three axes.
-        from_earlier, from_later, conditional = (
-            np.repeat(matrix, 3, axis=1)
-            for matrix in interpolation_weights(dt_s[:, None], (step_s - dt_s)[:, None], self._times_s())
+        weights = np.repeat(
+            interpolation_weights(dt_s[:, None], (step_s - dt_s)[:, None], self._times_s()), 3, axis=2
         )
-        magnus, earlier_rate, later_rate = (
-            (step_s**2 / 12)[:, None],
-            before.angular_velocity,
-            after.angular_velocity,
-        )
+        magnus, magnus_here = (step_s**2 / 12)[:, None], (dt_s**2 / 12)[:, None]
+        earlier_rate, later_rate = before.angular_velocity, after.angular_velocity
         full_rotvec = rotation_between(before, after)
-        later_rotvec = full_rotvec - magnus * cross(earlier_rate, later_rate)
-        zero = np.zeros((len(time_s), 3))
-        earlier_axes = np.stack(
-            [np.concatenate([before.position, zero], axis=1), _velocities(before), _accelerations(before)],
-            axis=-1,
+        known = np.zeros((2 * count, 6, 3))
+        known[:, :3, 0], known[count:, 3:, 0] = (
+            both.position,
+            full_rotvec - magnus * cross(earlier_rate, later_rate),
         )
-        later_axes = np.stack(
-            [
-                np.concatenate([after.position, later_rotvec], axis=1),
-                _velocities(after),
-                _accelerations(after),
-            ],
-            axis=-1,
-        )
-        axes = (from_earlier @ earlier_axes[..., None] + from_later @ later_axes[..., None])[..., 0]
-        magnus_here, rate_here = (dt_s**2 / 12)[:, None], axes[:, 3:, 1]
+        known[:, :3, 1], known[:, 3:, 1] = both.velocity, both.angular_velocity
+        known[:, :3, 2], known[:, 3:, 2] = both.acceleration, both.angular_acceleration
+        by_knot = matvec(weights[:2], known.reshape(2, count, 6, 3))
+        axes = by_knot[0] + by_knot[1]
+        rate_here = axes[:, 3:, 1]
         rotvec = axes[:, 3:, 0] + magnus_here * cross(earlier_rate, rate_here)
         delta_R, J_r = exp_and_right_jacobian(rotvec)
         states = _states(time_s, axes[:, :3, 0], before.rotation @ delta_R, axes)
-        by_earlier, by_later = axes_to_state(from_earlier), axes_to_state(from_later)
+        sigmas = axis_sigmas(self.prior)[None] if self.sigmas is None else self.sigmas[later - 1]
+        weights[2] *= (self.process_noise_share * sigmas**2)[:, :, None, None]
+        by_earlier, by_later, conditional = axes_to_state(weights.reshape(-1, 6, 3, 3)).reshape(
+            3, count, STATE_DIM, STATE_DIM
+        )
         # The later rotation enters as the rotation vector from the earlier one minus its Magnus term.
         by_rotation, J_r_inv = by_later[:, :, 3:6].copy(), inverse_right_jacobian(full_rotvec)
         by_later[:, :, 3:6] = by_rotation @ J_r_inv
         by_later[:, :, 9:12] -= by_rotation @ (magnus[..., None] * skew(earlier_rate))
         # The inverse Jacobian of the opposite rotation is the transpose.
-        by_earlier[:, :, 3:6] = -by_rotation @ np.swapaxes(J_r_inv, 1, 2)
+        by_earlier[:, :, 3:6] = -by_rotation @ J_r_inv.swapaxes(1, 2)
         by_earlier[:, :, 9:12] += by_rotation @ (magnus[..., None] * skew(later_rate))
         to_error = _linear_to_error(J_r, magnus_here, earlier_rate)[:, :dim]
         by_earlier, by_later = to_error @ by_earlier, to_error @ by_later
         by_earlier[:, 3:6, 9:12] -= J_r @ (magnus_here[..., None] * skew(rate_here))
-        by_earlier[:, 3:6, 3:6] += np.swapaxes(delta_R, 1, 2)
-        sigmas = axis_sigmas(self.prior)[None] if self.sigmas is None else self.sigmas[later - 1]
-        process = to_error @ axes_to_state(
-            conditional * (self.process_noise_share * sigmas**2)[:, :, None, None]
-        )
-        coupling = by_earlier @ self.cross_covariance[later - 1] @ np.swapaxes(by_later, 1, 2)
+        by_earlier[:, 3:6, 3:6] += delta_R.swapaxes(1, 2)
+        to_later = by_later.swapaxes(1, 2)
+        coupling = by_earlier @ self.cross_covariance[later - 1] @ to_later
         covariance = (
-            by_earlier @ self.covariance[later - 1] @ np.swapaxes(by_earlier, 1, 2)
-            + by_later @ self.covariance[later] @ np.swapaxes(by_later, 1, 2)
+            by_earlier @ self.covariance[later - 1] @ by_earlier.swapaxes(1, 2)
+            + by_later @ self.covariance[later] @ to_later
             + coupling
-            + np.swapaxes(coupling, 1, 2)
+            + coupling.swapaxes(1, 2)
         )
-        return states, _symmetric(covariance + process @ np.swapaxes(to_error, 1, 2))
+        return states, _symmetric(covariance + to_error @ conditional @ to_error.swapaxes(1, 2))
 
     def _times_s(self) -> FloatArray:
         """(2,) correlation times of the linear and the angular axes in s."""
@@ -207,7 +201,7 @@ def _accelerations(knots: States) -> FloatArray:
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:
-    return 0.5 * (matrix + np.swapaxes(matrix, 1, 2))
+    return 0.5 * (matrix + matrix.swapaxes(1, 2))
 
 
 def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -218,7 +212,7 @@ def ros_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
     to_fixed_axes = np.zeros((len(rotation), 6, 6))
     to_fixed_axes[:, :3, :3] = IDENTITY
     to_fixed_axes[:, 3:, 3:] = rotation
-    return _symmetric(to_fixed_axes @ covariance[:, :6, :6] @ np.swapaxes(to_fixed_axes, 1, 2))
+    return _symmetric(to_fixed_axes @ covariance[:, :6, :6] @ to_fixed_axes.swapaxes(1, 2))
 
 
 def state_at_point(
@@ -240,7 +234,7 @@ def state_at_point(
     )
     by_error = np.repeat(_IDENTITY_18[:, :6, :6], len(states), axis=0)
     by_error[:, :3, 3:] = -rotation @ skew(lever_arm)
-    return moved, _symmetric(by_error @ covariance[:, :6, :6] @ np.swapaxes(by_error, 1, 2))
+    return moved, _symmetric(by_error @ covariance[:, :6, :6] @ by_error.swapaxes(1, 2))
 
 
 def with_second_order_terms(rotation: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -260,6 +254,6 @@ def with_second_order_terms(rotation: FloatArray, covariance: FloatArray) -> tup
     curvature = cross(displacement, np.swapaxes(rotation @ axes, 1, 2))
     total_curvature = curvature.sum(axis=1)
     with_curvature: FloatArray = covariance.copy()
-    with_curvature[:, :3, :3] += 0.5 * (np.swapaxes(curvature, 1, 2) @ curvature)
+    with_curvature[:, :3, :3] += 0.5 * (curvature.swapaxes(1, 2) @ curvature)
     with_curvature[:, :3, :3] += 0.25 * total_curvature[:, :, None] * total_curvature[:, None, :]
     return with_curvature, np.sqrt(np.where(variance[:, -1] >= 0, variance[:, -1], np.nan))

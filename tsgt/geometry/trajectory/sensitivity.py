@@ -38,7 +38,7 @@ def coupling(
     """(K, 18, r) mixed block of the normal equations of K states and of the set-up, from the (M, 3, r) Jacobian by it."""
     information = np.linalg.inv(linearised.covariance(observations)) * weights[:, None, None]
     mixed = np.zeros((count, STATE_DIM, by_setup.shape[2]))
-    np.add.at(mixed, knot_index, np.swapaxes(linearised.jacobian, 1, 2) @ (information @ by_setup))
+    np.add.at(mixed, knot_index, linearised.jacobian.swapaxes(1, 2) @ (information @ by_setup))
     return mixed
 
 
@@ -49,7 +49,7 @@ def sensitivity(factor: BlockCholesky, mixed: FloatArray) -> FloatArray:
 
 def common_covariance(displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Covariance of the states from the set-up alone: of each, (K, 18, 18), and with the next one, (K - 1, 18, 18)."""
-    transposed = np.swapaxes(displacement, 1, 2)
+    transposed = displacement.swapaxes(1, 2)
     return displacement @ transposed, displacement[:-1] @ transposed[1:]
 
 

@@ -78,7 +78,7 @@ class States:
         return np.concatenate(
             [
                 self.position - other.position,
-                fast_log_so3(np.swapaxes(other.rotation, 1, 2) @ self.rotation),
+                fast_log_so3(other.rotation.swapaxes(1, 2) @ self.rotation),
                 self.velocity - other.velocity,
                 self.angular_velocity - other.angular_velocity,
                 self.acceleration - other.acceleration,
@@ -163,7 +163,7 @@ def linearise_process(knots: States, factors: ProcessFactors) -> LinearisedProce
     by_earlier, by_later = np.empty((count, 3, 6)), np.empty((count, 3, 6))
     J_r_inv = inverse_right_jacobian(rotvec)
     # The inverse Jacobian of the opposite rotation is the transpose.
-    by_earlier[:, :, :3], by_later[:, :, :3] = -np.swapaxes(J_r_inv, 1, 2), J_r_inv
+    by_earlier[:, :, :3], by_later[:, :, :3] = -J_r_inv.swapaxes(1, 2), J_r_inv
     by_earlier[:, :, 3:] = skew(magnus * after)
     by_later[:, :, 3:] = skew(-magnus * before)
     residuals = np.swapaxes(later - matvec(factors.phi, earlier), 1, 2).reshape(count, STATE_DIM)
@@ -184,19 +184,19 @@ def add_process_factors(
     count = len(factors.phi)
     translation = slice(0, 3)
     phi, information = factors.phi[:, translation], factors.information[:, translation]
-    phi_information = np.swapaxes(phi, 2, 3) @ information
+    phi_information = phi.swapaxes(2, 3) @ information
     diagonal_blocks = np.zeros((count + 1, 3, 3, 3))
     diagonal_blocks[:-1] = phi_information @ phi
     diagonal_blocks[1:] += information
     _translation_blocks(diagonal)[...] += diagonal_blocks
     _translation_blocks(off_diagonal)[...] -= phi_information
     residuals = linearised.residuals.reshape(count, 3, 2, 3)
-    translation_residuals = np.swapaxes(residuals[:, :, 0], 1, 2)
+    translation_residuals = residuals[:, :, 0].swapaxes(1, 2)
     weighted = matvec(information, translation_residuals)
     cost = float((weighted * translation_residuals).sum())
     gradient_by_kind = gradient.reshape(-1, 3, 2, 3)
-    gradient_by_kind[1:, :, 0] += np.swapaxes(weighted, 1, 2)
-    gradient_by_kind[:-1, :, 0] -= np.swapaxes(matvec(np.swapaxes(phi, 2, 3), weighted), 1, 2)
+    gradient_by_kind[1:, :, 0] += weighted.swapaxes(1, 2)
+    gradient_by_kind[:-1, :, 0] -= np.swapaxes(matvec(phi.swapaxes(2, 3), weighted), 1, 2)
 
     # Jacobian of (rotation, angular velocity, angular acceleration) by the errors of both knots, 9 each; the residuals last.
     jacobian = np.zeros((count, 9, 19))
@@ -209,7 +209,7 @@ def add_process_factors(
     jacobian[:, :, 18] = residuals[:, :, 1].reshape(count, 9)
     weights = np.zeros((count, 9, 9))
     np.einsum("niaja->naij", weights.reshape(count, 3, 3, 3, 3))[...] = factors.information[:, 3:]
-    normal = np.swapaxes(jacobian, 1, 2) @ (weights @ jacobian)
+    normal = jacobian.swapaxes(1, 2) @ (weights @ jacobian)
     for matrix, block in (
         (diagonal[:-1], normal[:, :9, :9]),
         (diagonal[1:], normal[:, 9:18, 9:18]),
@@ -240,7 +240,7 @@ def rotation_between(before: States, after: States) -> FloatArray:
 
     Below 0.3 rad a whole revolution and none are indistinguishable, and the short way is taken.
     """
-    rotvec = fast_log_so3(np.swapaxes(before.rotation, 1, 2) @ after.rotation)
+    rotvec = fast_log_so3(before.rotation.swapaxes(1, 2) @ after.rotation)
     angle = np.sqrt(dot(rotvec, rotvec))[:, None]
     if not (angle > _MIN_WRAP_RAD).any():
         return rotvec
@@ -255,6 +255,5 @@ def rotation_between(before: States, after: States) -> FloatArray:
 def axes_to_state(by_axis: FloatArray) -> FloatArray:
     """Expand matrices per axis, (N, 6, 3, 3), to matrices of the state's error, (N, 18, 18)."""
     matrix = np.zeros((len(by_axis), 3, 6, 3, 6))
-    axes = np.arange(6)
-    matrix[:, :, axes, :, axes] = by_axis.transpose(1, 0, 2, 3)
+    np.einsum("niaja->naij", matrix)[...] = by_axis
     return matrix.reshape(-1, STATE_DIM, STATE_DIM)

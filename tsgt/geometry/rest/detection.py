@@ -9,6 +9,7 @@ white at the rate of the measurements. See docs/explanation/continuous-trajector
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -225,8 +226,7 @@ class _Windows:
         scatter = np.maximum(variance, MIN_SCATTER)
         return _Statistics(
             trend,
-            # The quantiles of F and chi-square themselves: the checks of scipy.stats cost several times as much.
-            scatter * trends * fdtri(trends, remaining, 1.0 - TREND_SIGNIFICANCE),
+            scatter * trends * _trend_quantiles(trends, remaining),
             about_mean,
             total(steps),
             freedom,
@@ -247,6 +247,18 @@ class _Statistics(NamedTuple):
     scatter: FloatArray  # Variance about the trends over the stated one
     creep: FloatArray  # Chi-square that a speed of 1 m/s would add to the trends, in the direction that is measured worst
     vibration_m2: FloatArray
+
+
+@lru_cache(maxsize=65536)
+def _trend_quantile(trends: int, remaining: float) -> float:
+    # The quantiles of F and chi-square themselves: the checks of scipy.stats cost several times as much.
+    return float(fdtri(trends, remaining, 1.0 - TREND_SIGNIFICANCE))
+
+
+def _trend_quantiles(trends: NDArray[np.intp], remaining: FloatArray) -> FloatArray:
+    """Quantiles of F for numbers of trends and remaining degrees of freedom, (N,): few different ones, which are dear."""
+    pairs = zip(trends.tolist(), remaining.tolist(), strict=True)
+    return np.array([_trend_quantile(*each) for each in pairs], np.float64)
 
 
 def _median(values: FloatArray) -> FloatArray:

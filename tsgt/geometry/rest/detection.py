@@ -279,6 +279,9 @@ def _is_white(steps: FloatArray, scatter: FloatArray, freedom: FloatArray) -> ND
 def _steady_runs(part: Series) -> Iterator[tuple[int, int]]:
     """Slices of the rows of a run that no long window contradicts: short ones do not tell a slow sway."""
     count = len(part)
+    if count and abs(part.time_s[-1] - part.time_s[0]) < STEADY_WINDOWS_S[0]:
+        yield 0, count
+        return
     contradicted = np.zeros(count + 1, np.intp)
     for first in range(0, count, _CHUNK):
         starts = np.arange(min(_CHUNK, count - first))

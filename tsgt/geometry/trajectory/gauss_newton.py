@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.geometry.rigid import dot, inverse_right_jacobian
+from tsgt.geometry.rigid import dot, fast_log_so3, inverse_right_jacobian
 from tsgt.geometry.trajectory.block_tridiagonal import BlockCholesky, factorise
 from tsgt.geometry.trajectory.measurement_factors import linearise
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
@@ -265,13 +265,18 @@ def assemble(
     gradient = np.zeros((len(knots), STATE_DIM))
     add_measurements(whitened, weights, knot_index, diagonal, gradient)
     cost = float(loss.sum())
+    first, reference = knots.select(slice(0, 1)), anchor.linearisation_point
+    rotvec, by_rotation = None, None
     for start in range(0, len(off_diagonal), _FACTORS_PER_CHUNK):
         chunk, chunk_knots = (
             slice(start, start + _FACTORS_PER_CHUNK),
             slice(start, start + _FACTORS_PER_CHUNK + 1),
         )
         chunk_process = process.select(chunk)
-        linearised_process = linearise_process(knots.select(chunk_knots), chunk_process)
+        linearised_process = linearise_process(
+            knots.select(chunk_knots), chunk_process, None if start else reference.rotation
+        )
+        rotvec, by_rotation = linearised_process.from_given or (rotvec, by_rotation)
         cost += add_process_factors(
             linearised_process,
             chunk_process,
@@ -280,9 +285,12 @@ def assemble(
             gradient[chunk_knots],
         )
 
-    error = knots.select(slice(0, 1)).local_coordinates_about(anchor.linearisation_point)[0]
+    if rotvec is None or by_rotation is None:  # a single knot
+        rotvec = fast_log_so3(reference.rotation.swapaxes(1, 2) @ first.rotation)[0]
+        by_rotation = inverse_right_jacobian(rotvec)
+    error = first.differences_from(reference, rotvec[None])[0]
     by_error = np.eye(STATE_DIM)
-    by_error[3:6, 3:6] = inverse_right_jacobian(error[3:6])
+    by_error[3:6, 3:6] = by_rotation
     error -= anchor.mean
     weighted = by_error.T @ anchor.information
     diagonal[0] += weighted @ by_error

@@ -75,10 +75,14 @@ class States:
 
     def local_coordinates_about(self, other: States) -> FloatArray:
         """Return the errors d, (K, 18), of these states about others: ``other.retract(d)`` gives these states."""
+        return self.differences_from(other, fast_log_so3(other.rotation.swapaxes(1, 2) @ self.rotation))
+
+    def differences_from(self, other: States, rotvec: FloatArray) -> FloatArray:
+        """Return :meth:`local_coordinates_about` with known rotation vectors, (K, 3), from the other rotations to these."""
         return np.concatenate(
             [
                 self.position - other.position,
-                fast_log_so3(other.rotation.swapaxes(1, 2) @ self.rotation),
+                rotvec,
                 self.velocity - other.velocity,
                 self.angular_velocity - other.angular_velocity,
                 self.acceleration - other.acceleration,
@@ -140,19 +144,30 @@ class LinearisedProcess:
     residuals: FloatArray  # (K - 1, 18)
     rotation_by_earlier: FloatArray  # (K - 1, 3, 6) by the errors of rotation and angular velocity
     rotation_by_later: FloatArray  # (K - 1, 3, 6)
+    # Rotation vector from a given rotation to that of the first knot, (3,), and its Jacobian by the knot's error, (3, 3)
+    from_given: tuple[FloatArray, FloatArray] | None = None
 
 
-def linearise_process(knots: States, factors: ProcessFactors) -> LinearisedProcess:
+def linearise_process(
+    knots: States, factors: ProcessFactors, given: FloatArray | None = None
+) -> LinearisedProcess:
     """Residuals and exact Jacobians of the process factors.
+
+    With a ``given`` rotation, (1, 3, 3), also ``from_given``, in the same pass.
 
     The rotation vector between two knots is the integral of the angular velocity only for a fixed axis of rotation. For a
     moving axis, dt^2 / 12 times the cross product of both angular velocities is subtracted (Magnus expansion, W. Magnus,
     1954, to fourth order in dt); the rest is linear in the angular acceleration, like the prior.
     """
     count = len(knots) - 1
-    rotvec = rotation_between(knots.select(slice(None, -1)), knots.select(slice(1, None)))
+    rotation, extra = knots.rotation, 0
+    if given is not None:
+        rotation, extra = np.concatenate([given, rotation]), 1
     before, after = knots.angular_velocity[:-1], knots.angular_velocity[1:]
-    magnus = ((knots.time_s[1:] - knots.time_s[:-1]) ** 2 / 12)[:, None]
+    dt_s = knots.time_s[1:] - knots.time_s[:-1]
+    rotvecs = fast_log_so3(rotation[:-1].swapaxes(1, 2) @ rotation[1:])
+    rotvec = rotvecs[extra:] = _unwrapped(rotvecs[extra:], dt_s, before, after)
+    magnus = (dt_s**2 / 12)[:, None]
     states = np.empty((count + 1, 6, 3))
     states[:, :3, 1], states[:, 3:, 1] = knots.velocity, knots.angular_velocity
     states[:, :3, 2], states[:, 3:, 2] = knots.acceleration, knots.angular_acceleration
@@ -161,13 +176,15 @@ def linearise_process(knots: States, factors: ProcessFactors) -> LinearisedProce
     later[:, :3, 0] = knots.position[1:] - knots.position[:-1]
     later[:, 3:, 0] = rotvec - magnus * cross(before, after)
     by_earlier, by_later = np.empty((count, 3, 6)), np.empty((count, 3, 6))
-    J_r_inv = inverse_right_jacobian(rotvec)
+    J_r_invs = inverse_right_jacobian(rotvecs)
+    J_r_inv = J_r_invs[extra:]
     # The inverse Jacobian of the opposite rotation is the transpose.
     by_earlier[:, :, :3], by_later[:, :, :3] = -J_r_inv.swapaxes(1, 2), J_r_inv
     by_earlier[:, :, 3:] = skew(magnus * after)
     by_later[:, :, 3:] = skew(-magnus * before)
     residuals = np.swapaxes(later - matvec(factors.phi, earlier), 1, 2).reshape(count, STATE_DIM)
-    return LinearisedProcess(earlier, later, residuals, by_earlier, by_later)
+    from_given = None if given is None else (rotvecs[0], J_r_invs[0])
+    return LinearisedProcess(earlier, later, residuals, by_earlier, by_later, from_given)
 
 
 def add_process_factors(
@@ -241,11 +258,16 @@ def rotation_between(before: States, after: States) -> FloatArray:
     Below 0.3 rad a whole revolution and none are indistinguishable, and the short way is taken.
     """
     rotvec = fast_log_so3(before.rotation.swapaxes(1, 2) @ after.rotation)
+    return _unwrapped(rotvec, after.time_s - before.time_s, before.angular_velocity, after.angular_velocity)
+
+
+def _unwrapped(
+    rotvec: FloatArray, dt_s: FloatArray, rate_before: FloatArray, rate_after: FloatArray
+) -> FloatArray:
     angle = np.sqrt(dot(rotvec, rotvec))[:, None]
     if not (angle > _MIN_WRAP_RAD).any():
         return rotvec
-    dt_s = (after.time_s - before.time_s)[:, None]
-    expected = 0.5 * dt_s * (before.angular_velocity + after.angular_velocity)
+    expected = 0.5 * dt_s[:, None] * (rate_before + rate_after)
     complement = rotvec * (1.0 - 2 * np.pi / np.maximum(angle, _MIN_WRAP_RAD))
     error, complement_error = rotvec - expected, complement - expected
     longer = (angle[:, 0] > _MIN_WRAP_RAD) & (dot(complement_error, complement_error) < dot(error, error))

@@ -160,13 +160,16 @@ def linearise_process(
     1954, to fourth order in dt); the rest is linear in the angular acceleration, like the prior.
     """
     count = len(knots) - 1
-    rotation, extra = knots.rotation, 0
-    if given is not None:
-        rotation, extra = np.concatenate([given, rotation]), 1
     before, after = knots.angular_velocity[:-1], knots.angular_velocity[1:]
     dt_s = knots.time_s[1:] - knots.time_s[:-1]
-    rotvecs = fast_log_so3(rotation[:-1].swapaxes(1, 2) @ rotation[1:])
-    rotvec = rotvecs[extra:] = _unwrapped(rotvecs[extra:], dt_s, before, after)
+    rotvec = _unwrapped(
+        fast_log_so3(knots.rotation[:-1].swapaxes(1, 2) @ knots.rotation[1:]), dt_s, before, after
+    )
+    rotvecs, extra = rotvec, 0
+    if given is not None:
+        # Not in one pass with the others: its digits must not depend on how far the robot turns in a step.
+        from_given = fast_log_so3(given.swapaxes(1, 2) @ knots.rotation[:1])
+        rotvecs, extra = np.concatenate([from_given, rotvec]), 1
     magnus = (dt_s**2 / 12)[:, None]
     states = np.empty((count + 1, 6, 3))
     states[:, :3, 1], states[:, 3:, 1] = knots.velocity, knots.angular_velocity
@@ -183,8 +186,10 @@ def linearise_process(
     by_earlier[:, :, 3:] = skew(magnus * after)
     by_later[:, :, 3:] = skew(-magnus * before)
     residuals = np.swapaxes(later - matvec(factors.phi, earlier), 1, 2).reshape(count, STATE_DIM)
-    from_given = None if given is None else (rotvecs[0], J_r_invs[0])
-    return LinearisedProcess(earlier, later, residuals, by_earlier, by_later, from_given)
+    return LinearisedProcess(
+        *(earlier, later, residuals, by_earlier, by_later),
+        None if given is None else (rotvecs[0], J_r_invs[0]),
+    )
 
 
 def add_process_factors(

@@ -12,9 +12,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.geometry.inertial.odometry import add_wheel_processes, linearise_odometry
+from tsgt.geometry.inertial.odometry import add_wheel_processes, linearise_odometry, wheel_process_cost
 from tsgt.geometry.inertial.preintegration import Preintegrated, concatenate_preintegrated, preintegrate
-from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, Gravity, InertialStates
+from tsgt.geometry.inertial.states import (
+    INERTIAL_STATE_DIM,
+    TILT_DIM,
+    Gravity,
+    InertialStates,
+    concatenate_inertial_states,
+)
 from tsgt.geometry.rigid import (
     IDENTITY,
     FloatArray,
@@ -31,6 +37,8 @@ from tsgt.geometry.trajectory.motion_prior import process_information, transitio
 from tsgt.geometry.trajectory.states import States
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from tsgt.geometry.inertial.odometry import Odometry, OdometrySteps
@@ -69,10 +77,11 @@ class InertialFactors:
         *,
         gyro_only: MotionPrior | None = None,
         odometry: Odometry | None = None,
+        found: Preintegrated | None = None,
     ) -> InertialFactors:
         """Preintegrate between the states' times, about their biases; ``gyro_only``: prior of the motion in place of forces.
 
-        ``odometry``: where the states have wheels.
+        ``odometry``: where the states have wheels. ``found``: what is preintegrated already.
         """
         return cls.between(
             samples,
@@ -81,6 +90,7 @@ class InertialFactors:
             noise,
             gyro_only=gyro_only,
             odometry=odometry,
+            found=found,
         )
 
     @classmethod
@@ -201,7 +211,8 @@ def assemble_inertial(
     count, size, shared = len(knots), knots.dim, gravity.dim
     earlier_part, later_part = slice(0, size), slice(size, 2 * size)
     shared_part, residual = slice(2 * size, 2 * size + shared), 2 * size + shared
-    linearised = linearise(observations, _as_states(knots, kinematics, gravity, factors), knot_index)
+    states = _as_states(knots, kinematics, gravity.vector(), with_accelerometer=factors.with_accelerometer)
+    linearised = linearise(observations, states, knot_index)
     whitened = by_inertial_states(
         linearised.whitened(observations), gyro_only=not factors.with_accelerometer, dim=size
     )
@@ -277,12 +288,11 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     found = factors.preintegrated
     gyro_only = not factors.with_accelerometer
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
-    bias = found.accelerometer_bias if gyro_only else earlier.bias_or_acceleration
-    force = np.zeros((len(found), 3))
+    force = error = np.zeros((len(found), 3))
     if gravity.matrix.size:
         force = found.mean_force()
-        bias = bias + gravity.force_error(force)
-    position, rotation, velocity = found.corrected(earlier.gyro_bias, bias)
+        error = gravity.force_error(force)
+    position, rotation, velocity = _motion(earlier, found, error, gyro_only=gyro_only)
     R_T = earlier.rotation.swapaxes(1, 2)
     turned = R_T @ later.rotation
     residual = fast_log_so3(rotation.swapaxes(1, 2) @ turned)
@@ -298,11 +308,7 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
         whitened = factors.whitening @ by_rotation
         return np.concatenate([whitened, _motion_rows(earlier, later, factors, gravity.dim)], axis=1)
     duration_s = found.duration_s[:, None]
-    fall = gravity.vector()
-    moved = matvec(
-        R_T, later.position - earlier.position - earlier.velocity * duration_s - 0.5 * duration_s**2 * fall
-    )
-    gained = matvec(R_T, later.velocity - earlier.velocity - duration_s * fall)
+    moved, gained = _moved_and_gained(earlier, later, duration_s, gravity.vector())
     by_tilt = R_T @ gravity.by_tilt()
     rows = np.zeros((len(found), 9, column + 1))
     rows[:, 3:6] = by_rotation
@@ -322,6 +328,96 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
             rows[:, part, matrix_part] = -gravity.by_matrix(found.by_accelerometer_bias[:, part], force)
     whitened_rows: FloatArray = factors.whitening @ rows
     return whitened_rows
+
+
+def _motion(
+    earlier: InertialStates, found: Preintegrated, force_error: FloatArray, *, gyro_only: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, rotation and velocity preintegrated from K states, with their biases."""
+    if gyro_only:
+        return found.corrected(earlier.gyro_bias, found.accelerometer_bias)
+    return found.corrected(earlier.gyro_bias, earlier.bias_or_acceleration + force_error)
+
+
+def _moved_and_gained(
+    earlier: InertialStates, later: InertialStates, duration_s: FloatArray, fall: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(K, 3) each: what states say of the preintegrated position and velocity, in the axes of the earlier ones.
+
+    ``duration_s``: (K, 1); ``fall``: acceleration of a falling body, (3,) or (K, 3).
+    """
+    R_T = earlier.rotation.swapaxes(1, 2)
+    drifted = later.position - earlier.position - earlier.velocity * duration_s
+    moved = matvec(R_T, drifted - 0.5 * duration_s**2 * fall)
+    return moved, matvec(R_T, later.velocity - earlier.velocity - duration_s * fall)
+
+
+def inertial_costs(
+    observations: Observations,
+    knot_index: NDArray[np.intp],
+    trajectories: Sequence[tuple[InertialStates, Gravity]],
+    kinematics: tuple[FloatArray, FloatArray],
+    factors: InertialFactors,
+    anchor: InertialAnchor,
+    *,
+    rejectable: NDArray[np.bool_] | None = None,
+) -> FloatArray:
+    """Return the cost of each of N trajectories of the same knots, (N,), as :func:`assemble_inertial` gives it.
+
+    All are computed in one pass, without Jacobians: a search along a line needs no more of the points that it rejects.
+    """
+    number, count = len(trajectories), len(kinematics[0])
+    with_accelerometer = factors.with_accelerometer
+    knots = concatenate_inertial_states([each for each, _ in trajectories])
+    falls = np.stack([gravity.vector() for _, gravity in trajectories])
+
+    states = _as_states(
+        knots,
+        (np.tile(kinematics[0], (number, 1)), np.tile(kinematics[1], (number, 1))),
+        np.repeat(falls, count, axis=0),
+        with_accelerometer=with_accelerometer,
+    )
+    first_rows = count * np.arange(number)
+    measured = observations.select(np.tile(np.arange(len(observations)), number))
+    linearised = linearise(measured, states, (knot_index + first_rows[:, None]).ravel())
+    residuals = linearised.whitened(measured)[:, :, -1]
+    squares = dot(residuals, residuals).reshape(number, -1)
+    costs = np.array([float(robust_loss(each, rejectable=rejectable)[1].sum()) for each in squares])
+
+    rows = (np.arange(count - 1) + first_rows[:, None]).ravel()
+    earlier, later = knots.select(rows), knots.select(rows + 1)
+    steps = factors.select(np.tile(np.arange(count - 1), number))
+    found = steps.preintegrated
+    error = np.zeros((len(found), 3))
+    if anchor.shared.size > TILT_DIM:
+        force = factors.preintegrated.mean_force()
+        error = np.concatenate([gravity.force_error(force) for _, gravity in trajectories])
+    position, rotation, velocity = _motion(earlier, found, error, gyro_only=not with_accelerometer)
+    turned = fast_log_so3(rotation.swapaxes(1, 2) @ (earlier.rotation.swapaxes(1, 2) @ later.rotation))
+    walks = [(earlier.gyro_bias, later.gyro_bias, steps.walk_information[:, 0])]
+    if with_accelerometer:
+        fall = np.repeat(falls, count - 1, axis=0)
+        moved, gained = _moved_and_gained(earlier, later, found.duration_s[:, None], fall)
+        residual = np.concatenate([moved - position, turned, gained - velocity], axis=1)
+        squares = matvec(steps.whitening, residual) ** 2
+        walks.append((earlier.bias_or_acceleration, later.bias_or_acceleration, steps.walk_information[:, 1]))
+    else:
+        of_motion = _motion_rows(earlier, later, steps, 0)[:, :, -1]
+        squares = np.concatenate([matvec(steps.whitening, turned), of_motion], axis=1) ** 2
+    costs += squares.reshape(number, -1).sum(axis=1)
+    for before, after, information in walks:
+        costs += (information[:, None] * (after - before) ** 2).reshape(number, -1).sum(axis=1)
+    if factors.odometry is not None:
+        for row, (each, _) in enumerate(trajectories):
+            residuals = linearise_odometry(each, factors.odometry)[:, :, -1]
+            costs[row] += float(robust_loss(dot(residuals, residuals))[1].sum())
+            costs[row] += wheel_process_cost(each.wheels, factors.odometry)
+
+    first = knots.select(first_rows).local_coordinates_about(anchor.linearisation_point)
+    shared = np.stack([gravity.shared - anchor.shared for _, gravity in trajectories])
+    errors = np.concatenate([first, shared], axis=1) - anchor.mean
+    costs += ((errors @ anchor.information) * errors).sum(axis=1)
+    return costs
 
 
 def _motion_rows(
@@ -377,13 +473,17 @@ def _add_walks(
 def _as_states(
     knots: InertialStates,
     kinematics: tuple[FloatArray, FloatArray],
-    gravity: Gravity,
-    factors: InertialFactors,
+    fall: FloatArray,
+    *,
+    with_accelerometer: bool,
 ) -> States:
-    """States as measurement factors take them: rate and acceleration are those of the samples at the knots."""
+    """States as measurement factors take them: rate and acceleration are those of the samples at the knots.
+
+    ``fall``: acceleration of a falling body, (3,) or (K, 3).
+    """
     rate, force = kinematics
-    if factors.with_accelerometer:
-        acceleration = matvec(knots.rotation, force - knots.bias_or_acceleration) + gravity.vector()
+    if with_accelerometer:
+        acceleration = matvec(knots.rotation, force - knots.bias_or_acceleration) + fall
     else:
         acceleration = knots.bias_or_acceleration
     zero = np.zeros_like(rate)

@@ -19,6 +19,7 @@ from tsgt.geometry.rigid import FloatArray, exp_so3, log_so3, matvec
 from tsgt.geometry.trajectory.gauss_newton import LOOSE_GAIN_TOLERANCE
 
 if TYPE_CHECKING:
+    from tsgt.geometry.inertial.factors import InertialFactors
     from tsgt.geometry.inertial.solver import InertialSolution
     from tsgt.geometry.trajectory.measurement_factors import Observations
 
@@ -64,16 +65,21 @@ def search_heading(observations: Observations, setup: InertialSetup, gravity: Gr
         gained = gained + turned[step] @ found.velocity[step]
         turned[step + 1] = turned[step] @ found.rotation[step]
     level = _rotation_to_vertical(gained)
+    factors: InertialFactors | None = None  # The same for all headings: they start with the same biases
     solutions = []
     for heading in np.arange(HEADINGS) * (2 * np.pi / HEADINGS):
         rotation = exp_so3(np.array([0.0, 0.0, heading])) @ level @ turned
+        guess = states_on_tracks(observations, time_s, rotation, zero)
+        if factors is None:
+            factors = setup.factors(guess, found)
         try:
             solutions.append(
                 solve_inertial(
                     observations,
                     setup,
-                    states_on_tracks(observations, time_s, rotation, zero),
+                    guess,
                     gravity,
+                    factors=factors,
                     max_iterations=SEARCH_ITERATIONS,
                     gain_tolerance=LOOSE_GAIN_TOLERANCE,
                     reject_outliers=False,

@@ -290,11 +290,16 @@ def add_wheel_processes(
     """Add the processes of scale, slip and direction, (K, 3), in place; return the sum of squared Mahalanobis distances."""
     own = slice(diagonal.shape[-1] - WHEELS_DIM, diagonal.shape[-1])
     information = 1.0 / steps.process_variances()
-    error = wheels[1:] - steps.kept * wheels[:-1]
-    weighted = information * error
+    weighted = information * (wheels[1:] - steps.kept * wheels[:-1])
     np.einsum("kii->ki", diagonal[:-1, own, own])[...] += steps.kept**2 * information
     np.einsum("kii->ki", diagonal[1:, own, own])[...] += information
     np.einsum("kii->ki", off_diagonal[:, own, own])[...] -= steps.kept * information
     gradient[:-1, own] -= steps.kept * weighted
     gradient[1:, own] += weighted
-    return float((weighted * error).sum())
+    return wheel_process_cost(wheels, steps)
+
+
+def wheel_process_cost(wheels: FloatArray, steps: OdometrySteps) -> float:
+    """Sum of squared Mahalanobis distances of the processes of scale, slip and direction, (K, 3)."""
+    error = wheels[1:] - steps.kept * wheels[:-1]
+    return float((1.0 / steps.process_variances() * error * error).sum())

@@ -7,6 +7,7 @@ gyro has moved.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,6 +19,7 @@ from tsgt.geometry.inertial.factors import (
     InertialEquations,
     InertialFactors,
     assemble_inertial,
+    inertial_costs,
 )
 from tsgt.geometry.rigid import dot
 from tsgt.geometry.trajectory.gauss_newton import (
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.inertial.odometry import Odometry
-    from tsgt.geometry.inertial.preintegration import ContiguousSamples
+    from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated
     from tsgt.geometry.inertial.states import Gravity, InertialStates
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
@@ -57,6 +59,11 @@ is wrong by half its square.
 FAR_GAIN = 1e4
 """Predicted gain of a step beyond which it does not lead to the minimum yet: there the samples need not be integrated again."""
 
+MAX_KNOTS_TOGETHER = 2048  # Whose costs are computed in one pass: bounds the memory
+
+_FRACTIONS = tuple(0.5**n for n in range(int(-math.log2(MIN_STEP_FRACTION)) + 1))
+"""Of a step, that the search along it tries."""
+
 
 @dataclass(frozen=True, slots=True)
 class InertialSetup:
@@ -69,10 +76,10 @@ class InertialSetup:
     )
     odometry: Odometry | None = None  # With states that have wheels
 
-    def factors(self, knots: InertialStates) -> InertialFactors:
-        """Return the factors between knots."""
+    def factors(self, knots: InertialStates, found: Preintegrated | None = None) -> InertialFactors:
+        """Return the factors between knots; ``found``: preintegrated about their biases already."""
         return InertialFactors.of(
-            self.samples, knots, self.noise, gyro_only=self.gyro_only, odometry=self.odometry
+            self.samples, knots, self.noise, gyro_only=self.gyro_only, odometry=self.odometry, found=found
         )
 
 
@@ -220,7 +227,7 @@ class _Search:
         factors = self._integrated_again(knots, factors)
         system = self._evaluate(knots, gravity, factors)
         factor = _factorise(system)
-        far = False
+        far = shortened = False
         while iterations < max_iterations:
             iterations += 1
             step, shared = factor.solve(-system.gradient, -system.corner_gradient)
@@ -234,16 +241,20 @@ class _Search:
                 knots, gravity = knots.retract(step), gravity.retract(shared)
                 system = apply_linear_step(system, self.knot_index, step, gain)
                 break
-            fraction = 1.0
-            while fraction > MIN_STEP_FRACTION:
-                moved = knots.retract(fraction * step)
-                moved_gravity = gravity.retract(fraction * shared)
-                candidate = self._evaluate(moved, moved_gravity, factors)
-                if candidate.cost < system.cost - 0.1 * fraction * gain:
+            moved, moved_gravity = knots.retract(step), gravity.retract(shared)
+            # After a step that had to be shortened the next one is likely to be too.
+            candidate = None if shortened else self._evaluate(moved, moved_gravity, factors)
+            shortened = candidate is None or not candidate.cost < system.cost - 0.1 * gain
+            if candidate is None or shortened:
+                tried = _FRACTIONS if candidate is None else _FRACTIONS[1:]
+                points = [(knots.retract(each * step), gravity.retract(each * shared)) for each in tried]
+                costs = self._costs(points, factors)
+                enough = np.flatnonzero(costs < system.cost - 0.1 * gain * np.array(tried))
+                if not len(enough):
                     break
-                fraction /= 2.0
-            else:
-                break
+                shortened = tried[enough[0]] < 1.0
+                moved, moved_gravity = points[enough[0]]
+                candidate = self._evaluate(moved, moved_gravity, factors)
             decrease = system.cost - candidate.cost
             knots, gravity, system = moved, moved_gravity, candidate
             far = gain > FAR_GAIN
@@ -269,6 +280,26 @@ class _Search:
             factors,
             self.anchor,
             rejectable=self.rejectable,
+        )
+
+    def _costs(
+        self, trajectories: list[tuple[InertialStates, Gravity]], factors: InertialFactors
+    ) -> FloatArray:
+        """Return the cost of each of N trajectories, (N,)."""
+        together = max(MAX_KNOTS_TOGETHER // len(trajectories[0][0]), 1)
+        return np.concatenate(
+            [
+                inertial_costs(
+                    self.observations,
+                    self.knot_index,
+                    trajectories[begin : begin + together],
+                    self.kinematics,
+                    factors,
+                    self.anchor,
+                    rejectable=self.rejectable,
+                )
+                for begin in range(0, len(trajectories), together)
+            ]
         )
 
     def _integrated_again(self, knots: InertialStates, factors: InertialFactors) -> InertialFactors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
@@ -15,13 +15,17 @@ from tsgt.geometry.inertial.factors import (
     InertialAnchor,
     InertialFactors,
     assemble_inertial,
+    inertial_costs,
     linearise_inertial,
 )
-from tsgt.geometry.inertial.states import Gravity, InertialStates
+from tsgt.geometry.inertial.odometry import Odometry, WheelSamples
+from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
 from tsgt.geometry.trajectory import Observations
-from tsgt.model import MotionPrior
+from tsgt.model import MotionPrior, OdometryParameters
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import ContiguousSamples
     from tsgt.geometry.inertial.factors import InertialEquations
@@ -84,45 +88,70 @@ def test_rows_equal_differences(prior: MotionPrior | None) -> None:
         )
 
 
+class Problem(NamedTuple):
+    """Measurements, factors and an anchor of a few knots."""
+
+    observations: Observations
+    knot_index: NDArray[np.intp]
+    kinematics: tuple[FloatArray, FloatArray]
+    factors: InertialFactors
+    anchor: InertialAnchor
+
+    @classmethod
+    def of(
+        cls,
+        rng: np.random.Generator,
+        samples: ContiguousSamples,
+        states: InertialStates,
+        factors: InertialFactors,
+    ) -> Problem:
+        """Draw it; large factors against small measurements would hide the latter in rounding."""
+        factors = replace(
+            factors, whitening=1e-4 * factors.whitening, walk_information=1e-6 * factors.walk_information
+        )
+        knot_index = np.array([0, 1, 1, 3])
+        layout = rng.normal(size=(3, 3))
+        prism = np.array([0, 1, 2, 0])
+        world = states.position[knot_index] + np.einsum(
+            "nij,nj->ni", states.rotation[knot_index], layout[prism]
+        )
+        observations = Observations(
+            states.time_s[knot_index] + np.array([1e-3, -1e-3, 1e-3, 0.0]),
+            np.zeros(4),
+            world + rng.normal(scale=0.003, size=(4, 3)),
+            np.full((4, 3), 0.01),
+            np.ones(4, np.bool_),
+            np.zeros(4, np.intp),
+            prism,
+            np.eye(4)[None],
+            layout,
+        )
+        size = states.dim + 8
+        square = rng.normal(size=(size, size))
+        anchor = InertialAnchor(
+            states.select(slice(0, 1)).retract(rng.normal(scale=0.01, size=(1, states.dim))),
+            np.full(8, 0.01),
+            square @ square.T,
+            rng.normal(scale=0.01, size=size),
+        )
+        return cls(observations, knot_index, samples.at(states.time_s), factors, anchor)
+
+    def at(self, states: InertialStates, gravity: Gravity) -> InertialEquations:
+        """Return the normal equations."""
+        return assemble_inertial(
+            self.observations, self.knot_index, states, self.kinematics, gravity, self.factors, self.anchor
+        )
+
+
 @pytest.mark.parametrize("prior", [None, MotionPrior()], ids=["accelerometer", "gyro_only"])
 def test_gradient_equals_differences_of_the_cost(prior: MotionPrior | None) -> None:
     """The gradient of the normal equations is half that of the cost, measurements and anchor included."""
     rng = np.random.default_rng(2)
     samples, states, gravity = example(rng)
-    factors = InertialFactors.of(samples, states, NOISE, gyro_only=prior)
-    # Large factors against small measurements would hide the latter in rounding.
-    factors = replace(
-        factors, whitening=1e-4 * factors.whitening, walk_information=1e-6 * factors.walk_information
-    )
-    knot_index = np.array([0, 1, 1, 3])
-    layout = rng.normal(size=(3, 3))
-    prism = np.array([0, 1, 2, 0])
-    world = states.position[knot_index] + np.einsum("nij,nj->ni", states.rotation[knot_index], layout[prism])
-    observations = Observations(
-        states.time_s[knot_index] + np.array([1e-3, -1e-3, 1e-3, 0.0]),
-        np.zeros(4),
-        world + rng.normal(scale=0.003, size=(4, 3)),
-        np.full((4, 3), 0.01),
-        np.ones(4, np.bool_),
-        np.zeros(4, np.intp),
-        prism,
-        np.eye(4)[None],
-        layout,
-    )
-    square = rng.normal(size=(23, 23))
-    anchor = InertialAnchor(
-        states.select(slice(0, 1)).retract(rng.normal(scale=0.01, size=(1, 15))),
-        np.full(8, 0.01),
-        square @ square.T,
-        rng.normal(scale=0.01, size=23),
-    )
-    kinematics = samples.at(states.time_s)
+    problem = Problem.of(rng, samples, states, InertialFactors.of(samples, states, NOISE, gyro_only=prior))
 
     def at(error: FloatArray, shared: FloatArray) -> InertialEquations:
-        moved = gravity.retract(shared)
-        return assemble_inertial(
-            observations, knot_index, states.retract(error), kinematics, moved, factors, anchor
-        )
+        return problem.at(states.retract(error), gravity.retract(shared))
 
     zero = np.zeros((COUNT, 15))
     system = at(zero, np.zeros(8))
@@ -140,6 +169,38 @@ def test_gradient_equals_differences_of_the_cost(prior: MotionPrior | None) -> N
     h = 1e-3
     by_shared = [(at(zero, h * each).cost - at(zero, -h * each).cost) / (4 * h) for each in np.eye(8)]
     np.testing.assert_allclose(by_shared, system.corner_gradient, rtol=2e-3)
+
+
+@pytest.mark.parametrize("prior", [None, MotionPrior()], ids=["accelerometer", "gyro_only"])
+@pytest.mark.parametrize("driven", [False, True], ids=["alone", "odometry"])
+def test_costs_are_those_of_the_normal_equations(prior: MotionPrior | None, *, driven: bool) -> None:
+    """The costs of several trajectories at once, outliers included, equal those that their normal equations give."""
+    rng = np.random.default_rng(3)
+    samples, states, gravity = example(rng)
+    odometry = None
+    if driven:
+        states = states.with_wheels()
+        speeds = WheelSamples(samples.bounds_s[1:], np.diff(samples.bounds_s), rng.normal(size=len(samples)))
+        mounting = Mounting(np.eye(3), np.zeros(3))
+        odometry = Odometry.of(speeds, OdometryParameters(), mounting, np.zeros(3))
+    factors = InertialFactors.of(samples, states, NOISE, gyro_only=prior, odometry=odometry)
+    problem = Problem.of(rng, samples, states, factors)
+    points = [
+        (
+            states.retract(rng.normal(scale=scale, size=(COUNT, states.dim))),
+            gravity.retract(rng.normal(scale=scale, size=8)),
+        )
+        for scale in (0.0, 0.01, 0.3)
+    ]
+    found = inertial_costs(
+        problem.observations,
+        problem.knot_index,
+        points,
+        problem.kinematics,
+        factors=problem.factors,
+        anchor=problem.anchor,
+    )
+    np.testing.assert_allclose(found, [problem.at(*each).cost for each in points], rtol=1e-12)
 
 
 def test_gravity_is_tilted() -> None:

@@ -19,7 +19,6 @@ from tsgt.geometry.inertial.states import (
     TILT_DIM,
     Gravity,
     InertialStates,
-    concatenate_inertial_states,
 )
 from tsgt.geometry.rigid import (
     IDENTITY,
@@ -355,7 +354,8 @@ def _moved_and_gained(
 def inertial_costs(
     observations: Observations,
     knot_index: NDArray[np.intp],
-    trajectories: Sequence[tuple[InertialStates, Gravity]],
+    trajectories: InertialStates,
+    gravities: Sequence[Gravity],
     kinematics: tuple[FloatArray, FloatArray],
     factors: InertialFactors,
     anchor: InertialAnchor,
@@ -364,15 +364,13 @@ def inertial_costs(
 ) -> FloatArray:
     """Return the cost of each of N trajectories of the same knots, (N,), as :func:`assemble_inertial` gives it.
 
-    All are computed in one pass, without Jacobians: a search along a line needs no more of the points that it rejects.
+    ``trajectories``: states of the first, then of the second, and so on; ``gravities``: of each. All are computed in one pass, without Jacobians: a search along a line needs no more of the points that it rejects.
     """
-    number, count = len(trajectories), len(kinematics[0])
+    number, count = len(gravities), len(kinematics[0])
     with_accelerometer = factors.with_accelerometer
-    knots = concatenate_inertial_states([each for each, _ in trajectories])
-    falls = np.stack([gravity.vector() for _, gravity in trajectories])
-
+    falls = np.array([gravity.vector() for gravity in gravities])
     states = _as_states(
-        knots,
+        trajectories,
         (np.tile(kinematics[0], (number, 1)), np.tile(kinematics[1], (number, 1))),
         np.repeat(falls, count, axis=0),
         with_accelerometer=with_accelerometer,
@@ -382,16 +380,19 @@ def inertial_costs(
     linearised = linearise(measured, states, (knot_index + first_rows[:, None]).ravel())
     residuals = linearised.whitened(measured)[:, :, -1]
     squares = dot(residuals, residuals).reshape(number, -1)
-    costs = np.array([float(robust_loss(each, rejectable=rejectable)[1].sum()) for each in squares])
+    if rejectable is None:
+        costs: FloatArray = robust_loss(squares)[1].sum(axis=1)
+    else:
+        costs = np.array([robust_loss(each, rejectable=rejectable)[1].sum() for each in squares])
 
     rows = (np.arange(count - 1) + first_rows[:, None]).ravel()
-    earlier, later = knots.select(rows), knots.select(rows + 1)
+    earlier, later = trajectories.select(rows), trajectories.select(rows + 1)
     steps = factors.select(np.tile(np.arange(count - 1), number))
     found = steps.preintegrated
     error = np.zeros((len(found), 3))
     if anchor.shared.size > TILT_DIM:
         force = factors.preintegrated.mean_force()
-        error = np.concatenate([gravity.force_error(force) for _, gravity in trajectories])
+        error = np.concatenate([gravity.force_error(force) for gravity in gravities])
     position, rotation, velocity = _motion(earlier, found, error, gyro_only=not with_accelerometer)
     turned = fast_log_so3(rotation.swapaxes(1, 2) @ (earlier.rotation.swapaxes(1, 2) @ later.rotation))
     walks = [(earlier.gyro_bias, later.gyro_bias, steps.walk_information[:, 0])]
@@ -408,13 +409,14 @@ def inertial_costs(
     for before, after, information in walks:
         costs += (information[:, None] * (after - before) ** 2).reshape(number, -1).sum(axis=1)
     if factors.odometry is not None:
-        for row, (each, _) in enumerate(trajectories):
+        for row, first_row in enumerate(first_rows.tolist()):
+            each = trajectories.select(slice(first_row, first_row + count))
             residuals = linearise_odometry(each, factors.odometry)[:, :, -1]
             costs[row] += float(robust_loss(dot(residuals, residuals))[1].sum())
             costs[row] += wheel_process_cost(each.wheels, factors.odometry)
 
-    first = knots.select(first_rows).local_coordinates_about(anchor.linearisation_point)
-    shared = np.stack([gravity.shared - anchor.shared for _, gravity in trajectories])
+    first = trajectories.select(first_rows).local_coordinates_about(anchor.linearisation_point)
+    shared = np.array([gravity.shared for gravity in gravities]) - anchor.shared
     errors = np.concatenate([first, shared], axis=1) - anchor.mean
     costs += ((errors @ anchor.information) * errors).sum(axis=1)
     return costs

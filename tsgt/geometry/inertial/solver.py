@@ -247,13 +247,10 @@ class _Search:
             shortened = candidate is None or not candidate.cost < system.cost - 0.1 * gain
             if candidate is None or shortened:
                 tried = _FRACTIONS if candidate is None else _FRACTIONS[1:]
-                points = [(knots.retract(each * step), gravity.retract(each * shared)) for each in tried]
-                costs = self._costs(points, factors)
-                enough = np.flatnonzero(costs < system.cost - 0.1 * gain * np.array(tried))
-                if not len(enough):
+                shorter = self._along(knots, gravity, factors, step, shared, tried, system.cost, gain)
+                if shorter is None:
                     break
-                shortened = tried[enough[0]] < 1.0
-                moved, moved_gravity = points[enough[0]]
+                moved, moved_gravity, shortened = shorter
                 candidate = self._evaluate(moved, moved_gravity, factors)
             decrease = system.cost - candidate.cost
             knots, gravity, system = moved, moved_gravity, candidate
@@ -282,25 +279,41 @@ class _Search:
             rejectable=self.rejectable,
         )
 
-    def _costs(
-        self, trajectories: list[tuple[InertialStates, Gravity]], factors: InertialFactors
-    ) -> FloatArray:
-        """Return the cost of each of N trajectories, (N,)."""
-        together = max(MAX_KNOTS_TOGETHER // len(trajectories[0][0]), 1)
-        return np.concatenate(
-            [
-                inertial_costs(
-                    self.observations,
-                    self.knot_index,
-                    trajectories[begin : begin + together],
-                    self.kinematics,
-                    factors,
-                    self.anchor,
-                    rejectable=self.rejectable,
-                )
-                for begin in range(0, len(trajectories), together)
-            ]
-        )
+    def _along(
+        self,
+        knots: InertialStates,
+        gravity: Gravity,
+        factors: InertialFactors,
+        step: FloatArray,
+        shared: FloatArray,
+        fractions: tuple[float, ...],
+        cost: float,
+        gain: float,
+    ) -> tuple[InertialStates, Gravity, bool] | None:
+        """Return the point at the first fraction of a step that reduces the cost enough, and whether it is not the whole step."""
+        count = len(knots)
+        together = max(MAX_KNOTS_TOGETHER // count, 1)
+        for begin in range(0, len(fractions), together):
+            some = fractions[begin : begin + together]
+            error = np.concatenate([fraction * step for fraction in some])
+            moved = knots.select(np.tile(np.arange(count), len(some))).retract(error)
+            gravities = [gravity.retract(fraction * shared) for fraction in some]
+            costs = inertial_costs(
+                self.observations,
+                self.knot_index,
+                moved,
+                gravities,
+                self.kinematics,
+                factors,
+                self.anchor,
+                rejectable=self.rejectable,
+            )
+            enough = np.flatnonzero(costs < cost - 0.1 * gain * np.array(some))
+            if len(enough):
+                row = int(enough[0])
+                point = moved.select(slice(row * count, (row + 1) * count))
+                return point, gravities[row], some[row] < 1.0
+        return None
 
     def _integrated_again(self, knots: InertialStates, factors: InertialFactors) -> InertialFactors:
         """Integrate about the present biases if they have moved too far for the correction to first order."""

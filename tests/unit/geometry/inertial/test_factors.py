@@ -19,7 +19,7 @@ from tsgt.geometry.inertial.factors import (
     linearise_inertial,
 )
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples
-from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
+from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting, concatenate_inertial_states
 from tsgt.geometry.trajectory import Observations
 from tsgt.model import MotionPrior, OdometryParameters
 
@@ -185,22 +185,20 @@ def test_costs_are_those_of_the_normal_equations(prior: MotionPrior | None, *, d
         odometry = Odometry.of(speeds, OdometryParameters(), mounting, np.zeros(3))
     factors = InertialFactors.of(samples, states, NOISE, gyro_only=prior, odometry=odometry)
     problem = Problem.of(rng, samples, states, factors)
-    points = [
-        (
-            states.retract(rng.normal(scale=scale, size=(COUNT, states.dim))),
-            gravity.retract(rng.normal(scale=scale, size=8)),
-        )
-        for scale in (0.0, 0.01, 0.3)
-    ]
+    scales = (0.0, 0.01, 0.3)
+    moved = [states.retract(rng.normal(scale=scale, size=(COUNT, states.dim))) for scale in scales]
+    gravities = [gravity.retract(rng.normal(scale=scale, size=8)) for scale in scales]
     found = inertial_costs(
         problem.observations,
         problem.knot_index,
-        points,
+        concatenate_inertial_states(moved),
+        gravities,
         problem.kinematics,
-        factors=problem.factors,
-        anchor=problem.anchor,
+        problem.factors,
+        problem.anchor,
     )
-    np.testing.assert_allclose(found, [problem.at(*each).cost for each in points], rtol=1e-12)
+    expected = [problem.at(*each).cost for each in zip(moved, gravities, strict=True)]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_gravity_is_tilted() -> None:

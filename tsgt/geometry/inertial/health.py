@@ -47,6 +47,7 @@ DISAGREES_WITH_PRISMS = "it disagrees with the prisms"
 """Reason of a disagreement that innovations show."""
 ALONE = 3  # Successive measurements of one prism that disagree, where none other is measured: it cannot be told from the IMU
 
+_MIN_REPEATED = 2  # A value that occurs no more often never shows a limit
 _ROUNDING = 1e-9  # Of the product with the gyro matrix, relative
 
 HOLD_S = 2.0
@@ -127,12 +128,13 @@ class HealthMonitor:
         before = len(self._recent)
         values = np.concatenate([self._recent, values])
         same = np.zeros(values.shape, np.bool_)
+        changes = np.abs(values[1:] - values[:-1])
         # Of a sensor as a whole: the product mixes its axes, of which one may be zero.
         largest = np.abs(values.reshape(-1, 2, 3)).max(axis=2)
-        largest = np.repeat(np.maximum(largest[1:], largest[:-1]), 3, axis=1)
-        same[1:] = np.abs(np.diff(values, axis=0)) <= _ROUNDING * largest
+        largest = np.maximum(largest[1:], largest[:-1])
+        same[1:] = (changes.reshape(-1, 2, 3) <= _ROUNDING * largest[:, :, None]).reshape(-1, 6)
         self._check_stuck(new, np.logical_and.reduce(same[before:], axis=1))
-        at_limit = self._at_limit(values, same, float(np.median(new.duration_s)))[before:]
+        at_limit = self._at_limit(values, same, changes, new.duration_s)[before:]
         for sensor, columns in (("angular rate", slice(0, 3)), ("specific force", slice(3, 6))):
             rows = np.flatnonzero(at_limit[:, columns].any(axis=1))
             if len(rows):
@@ -156,35 +158,45 @@ class HealthMonitor:
                 self.stuck_from_s = min(self.stuck_from_s, float(new.end_s[row]) - self._same_s)
                 self._report("it repeats the same values", float(new.end_s[row]))
 
-    def _at_limit(self, values: FloatArray, same: NDArray[np.bool_], duration_s: float) -> NDArray[np.bool_]:
-        """Which values, (M, 6), are at the limit of their axis; ``same``: as the one before."""
-        changes = np.where(same[1:], np.inf, np.abs(np.diff(values, axis=0)))
+    def _at_limit(
+        self, values: FloatArray, same: NDArray[np.bool_], changes: FloatArray, duration_s: FloatArray
+    ) -> NDArray[np.bool_]:
+        """Which values, (M, 6), are at the limit of their axis; ``same``: as the one before; ``changes``, (M - 1, 6): from it."""
+        changes = np.where(same[1:], np.inf, changes)
         self._steps = np.fmin(self._steps, changes.reshape(-1, 2, 3).min(axis=(0, 2), initial=np.inf))
         found = np.zeros(values.shape, np.bool_)
         stuck = np.logical_and.reduce(same, axis=1, keepdims=True)
         same &= ~stuck
-        chance = STEP_SHARE * self._steps * np.sqrt(duration_s) / self._densities
+        most = _most_frequent(values[~stuck[:, 0]])
+        if most.max() <= _MIN_REPEATED and not same.any():
+            return found
+        chance = STEP_SHARE * self._steps * np.sqrt(float(np.median(duration_s))) / self._densities
         log_chance = np.minimum(np.log(np.maximum(chance, MIN_CHANCE)), -1e-9)
         # As often as chance does not repeat a value.
-        repeated, steps = np.repeat([np.log(LIMIT_CHANCE) / log_chance, self._steps], 3, axis=1)
+        repeated = np.repeat(np.log(LIMIT_CHANCE) / log_chance, 3)
+        rows = np.arange(len(values))[:, None]
+        # Of the run of values that are the same.
+        begin = np.maximum.accumulate(np.where(same, 0, rows), axis=0)
+        long = rows - begin >= repeated
+        often = most > np.maximum(repeated, _MIN_REPEATED)
+        if not (long.any() or often.any()):
+            return found
+        steps = np.repeat(self._steps, 3)
         moves = np.ptp(values, axis=0) > MIN_MOTION_STEPS * steps
         # The accelerometer's vertical axis is far from zero at rest.
         others_move = np.ones(6, np.bool_)
         others_move[3:] = moves[[4, 3, 3]] | moves[[5, 5, 4]]
-        rows = np.arange(len(values))[:, None]
-        # Of the run of values that are the same.
-        begin = np.maximum.accumulate(np.where(same, 0, rows), axis=0)
-        long = (rows - begin >= repeated) & (np.abs(values) > MIN_LIMITS) & others_move
+        long &= (np.abs(values) > MIN_LIMITS) & others_move
         for axis in np.flatnonzero(long.any(axis=0)):
             found[:, axis] = np.isin(begin[:, axis], begin[long[:, axis], axis])
-        for axis in np.flatnonzero(moves & _repeats(values[~stuck[:, 0]])):
+        for axis in np.flatnonzero(moves & often):
             changing = values[~stuck[:, 0], axis]
             ordered = np.sort(changing)
             ends = np.flatnonzero(np.diff(ordered, append=np.inf) > _ROUNDING * np.abs(ordered))
             counts = np.diff(ends, prepend=-1)
-            most = int(np.argmax(counts))
-            value, count = ordered[ends[most]], int(counts[most])
-            if count <= repeated[axis] or abs(value) < MIN_LIMITS[axis]:
+            run = int(np.argmax(counts))
+            value, count = ordered[ends[run]], int(counts[run])
+            if abs(value) < MIN_LIMITS[axis]:
                 continue
             near = int(np.count_nonzero(np.abs(changing - value) <= LIMIT_STEPS * steps[axis])) - count
             if count > 2 * near:
@@ -213,9 +225,11 @@ class HealthMonitor:
         self._problem, self._problem_s = problem, max(self._problem_s, time_s)
 
 
-def _repeats(values: FloatArray) -> NDArray[np.bool_]:
-    """Whether a value occurs three times or more, for each column of (M, C): fewer never show a limit."""
+def _most_frequent(values: FloatArray) -> NDArray[np.intp]:
+    """How often the most frequent value of each column of (M, C) occurs, (C,)."""
     ordered = np.sort(values, axis=0)
-    same = ~(np.diff(ordered, axis=0) > _ROUNDING * np.abs(ordered[:-1]))
-    found: NDArray[np.bool_] = np.logical_or.reduce(same[:-1] & same[1:], axis=0)
+    differs = np.diff(ordered, axis=0) > _ROUNDING * np.abs(ordered[:-1])
+    rows = np.arange(1, len(values))[:, None]
+    before = np.maximum.accumulate(np.where(differs, rows, 0), axis=0)
+    found: NDArray[np.intp] = (rows - before).max(axis=0, initial=0) + 1
     return found

@@ -248,10 +248,17 @@ class Sampler(DeviceSampler[SamplesLine, ImuSamples]):
     """The sampler of an IMU; values are angular rate and specific force."""
 
     def _values(self, line: SamplesLine, index: int, duration_ns: int) -> tuple[Vector3, Vector3]:
-        rate = _value(line.angular_rate_radps, line.delta_angle_rad, index, duration_ns)
-        force = _value(line.specific_force_mps2, line.delta_velocity_mps, index, duration_ns)
-        check_angular_rate([rate])
-        check_specific_force([force])
+        # The line has checked values, but not increments, whose durations it does not know.
+        if line.angular_rate_radps is not None:
+            rate = line.angular_rate_radps[index]
+        else:
+            rate = _mean(line.delta_angle_rad, index, duration_ns)
+            check_angular_rate([rate])
+        if line.specific_force_mps2 is not None:
+            force = line.specific_force_mps2[index]
+        else:
+            force = _mean(line.delta_velocity_mps, index, duration_ns)
+            check_specific_force([force])
         return rate, force
 
     def _record_of(self, times: RecordTimes, values: Sequence[tuple[Vector3, Vector3]]) -> ImuSamples:
@@ -262,12 +269,8 @@ class Sampler(DeviceSampler[SamplesLine, ImuSamples]):
         )
 
 
-def _value(
-    values: tuple[Vector3, ...] | None, increments: tuple[Vector3, ...] | None, index: int, duration_ns: int
-) -> Vector3:
-    """Return a sample, or its increment over its duration."""
-    if values is not None:
-        return values[index]
+def _mean(increments: tuple[Vector3, ...] | None, index: int, duration_ns: int) -> Vector3:
+    """Return an increment over its duration."""
     assert increments is not None  # noqa: S101 (a line has one of both)
     x, y, z = increments[index]
     duration_s = duration_ns / 1e9

@@ -45,11 +45,14 @@ def imu_failures(result: MissionResult) -> Iterator[str]:
         return
     samples = result.imu.samples
     rows = {key: row for row, key in enumerate(_keys(samples))}
+    found: set[int] = set()
     for master_log in result.master_logs:
         if (path := master_log.recording()) is not None:
-            yield from _recording_failures(master_log, path, samples, rows, result.imu.truth.latency_s)
+            recorded = [(line, index, rows.get(key)) for line, index, key in _recorded(path)]
+            found.update(row for _, _, row in recorded if row is not None)
+            yield from _recording_failures(master_log, path, samples, recorded, result.imu.truth.latency_s)
     if result.faults_end_s is not None:
-        yield from _missing(result, rows)
+        yield from _missing(result, found)
 
 
 def imu_status_failures(result: MissionResult) -> Iterator[str]:
@@ -100,13 +103,13 @@ def _recording_failures(
     master_log: MasterLog,
     path: Path,
     samples: DeviceSamples,
-    rows: dict[tuple[int, tuple[float, ...]], int],
+    recorded: list[tuple[ImuSamples, int, int | None]],
     latency_s: float,
 ) -> Iterator[str]:
     found: list[int] = []
     stamps_ns: list[int] = []
-    for line, index, key in _recorded(path):
-        if (row := rows.get(key)) is None:
+    for line, index, row in recorded:
+        if row is None:
             yield f"{path.name}: sample {line.sequence + index}: the IMU has not given it"
             return
         found.append(row)
@@ -124,16 +127,13 @@ def _recording_failures(
         )
 
 
-def _missing(result: MissionResult, rows: dict[tuple[int, tuple[float, ...]], int]) -> Iterator[str]:
-    """Compare what the program has printed after the faults with the recordings."""
+def _missing(result: MissionResult, found: set[int]) -> Iterator[str]:
+    """Compare what the program has printed after the faults with the recorded samples."""
     assert result.imu is not None  # noqa: S101 (checked by the caller)
     assert result.faults_end_s is not None  # noqa: S101 (checked by the caller)
     from_s, to_s = result.faults_end_s + RECOVERY_TIME_S, result.duration_s - LAST_LINE_S
     arrival_s = result.imu.samples.arrival_s
-    expected = set(np.flatnonzero((arrival_s >= from_s) & (arrival_s < to_s)).tolist())
-    for master_log in result.master_logs:
-        if (path := master_log.recording()) is not None:
-            expected -= {rows.get(key, -1) for _, _, key in _recorded(path)}
+    expected = set(np.flatnonzero((arrival_s >= from_s) & (arrival_s < to_s)).tolist()) - found
     total = np.count_nonzero((arrival_s >= from_s) & (arrival_s < to_s))
     if len(expected) > (1 - MIN_RECORDED_SHARE) * total:
         yield f"IMU: {len(expected)} of {total} samples from {from_s:g} to {to_s:g} s are not recorded"

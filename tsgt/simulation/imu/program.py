@@ -79,14 +79,17 @@ class ImuProgram(DeviceProgram):
             "specific_force_limit_mps2": model.accelerometer_range_mps2,
         }
 
+        host_ns = np.rint(samples.arrival_s * 1e9).astype(np.int64)
+        rates, forces = np.round(samples.angular_rate_radps, 9), np.round(samples.specific_force_mps2, 9)
+
         def line_of(rows: slice) -> dict[str, object]:
             return {
                 "type": "samples",
                 "counter": samples.counter[rows].tolist(),
                 "instrument_time_ns": samples.device_ns[rows].tolist(),
-                "host_time_ns": np.rint(samples.arrival_s[rows] * 1e9).astype(np.int64).tolist(),
-                "angular_rate_radps": np.round(samples.angular_rate_radps[rows], 9).tolist(),
-                "specific_force_mps2": np.round(samples.specific_force_mps2[rows], 9).tolist(),
+                "host_time_ns": host_ns[rows].tolist(),
+                "angular_rate_radps": rates[rows].tolist(),
+                "specific_force_mps2": forces[rows].tolist(),
             }
 
         super().__init__(hello, samples.arrival_s, line_of, clock)

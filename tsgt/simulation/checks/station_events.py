@@ -1,4 +1,4 @@
-"""Events of the stations against measurements and status: of an instrument's status, and of stations that are lost."""
+"""Events of the stations against measurements and status: of an instrument's status and battery, and of lost stations."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from tsgt.model import Status
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from tsgt.recording import StatusRecord
     from tsgt.simulation.mission import MasterLog
 
 LOST_S = 20.0
@@ -22,6 +23,10 @@ HEARD_S = 0.5
 """A station that was heard less than this ago must have been reported as recovered."""
 
 
+LOW_BATTERY_PERCENT, CHARGED_BATTERY_PERCENT = 20, 30
+"""Below the first a battery is low, from the second on it no longer is."""
+
+
 def event_failures(master_log: MasterLog, *, superframe: bool) -> Iterator[str]:
     """Yield the stations of which events are missing, or were not called for."""
     events = Counter((event.station, event.event) for event in master_log.events)
@@ -30,6 +35,7 @@ def event_failures(master_log: MasterLog, *, superframe: bool) -> Iterator[str]:
         if count != changes:
             yield f"station {station}: {count} events of its instrument's status, which has changed {changes} times"
     yield from _wrongly_lost(master_log, LOST_S if superframe else CLASSIC_LOST_S)
+    yield from _wrong_batteries(master_log)
 
 
 def _status_changes(master_log: MasterLog) -> Counter[int]:
@@ -51,23 +57,53 @@ def _status_changes(master_log: MasterLog) -> Counter[int]:
 
 
 def _wrongly_lost(master_log: MasterLog, lost_s: float) -> Iterator[str]:
-    changes = [event for event in master_log.events if event.event in ("station_lost", "station_recovered")]
-    lost: dict[int | None, bool] = {}
     reported: set[int] = set()
-    at = 0
-    for status in master_log.statuses:
-        while at < len(changes) and changes[at].stamp_ns <= status.stamp_ns:
-            lost[changes[at].station] = changes[at].event == "station_lost"
-            at += 1
+    for status, lost in _with_events(master_log, "station_lost", "station_recovered"):
         for station in status.stations:
-            heard_s = station.last_heard_s
+            heard_s, is_lost = station.last_heard_s, station.id in lost
             if heard_s is None or station.id in reported:
                 continue
-            is_lost = lost.get(station.id, False)
             if (heard_s > lost_s and not is_lost) or (heard_s < HEARD_S and is_lost):
                 reported.add(station.id)
                 yield (
                     f"station {station.id}: last heard {heard_s:.1f} s before the status at "
-                    f"{(status.stamp_ns - master_log.unix_at_zero_ns) / 1e9:.1f} s, by the events it is "
-                    f"{'lost' if is_lost else 'not lost'}"
+                    f"{_at_s(master_log, status):.1f} s, by the events it is {'lost' if is_lost else 'not lost'}"
                 )
+
+
+def _wrong_batteries(master_log: MasterLog) -> Iterator[str]:
+    reported: set[int] = set()
+    for status, low in _with_events(master_log, "battery_low", "battery_recovered"):
+        for station in status.stations:
+            percent, is_low = station.battery_percent, station.id in low
+            if percent is None or station.id in reported:
+                continue
+            if (percent < LOW_BATTERY_PERCENT and not is_low) or (
+                percent >= CHARGED_BATTERY_PERCENT and is_low
+            ):
+                reported.add(station.id)
+                yield (
+                    f"station {station.id}: {percent} % in its battery by the status at {_at_s(master_log, status):.1f} s, "
+                    f"by the events it is {'low' if is_low else 'not low'}"
+                )
+
+
+def _with_events(
+    master_log: MasterLog, begins: str, ends: str
+) -> Iterator[tuple[StatusRecord, set[int | None]]]:
+    """Yield each status with the stations in the state that one event begins and another one ends."""
+    changes = [event for event in master_log.events if event.event in (begins, ends)]
+    inside: set[int | None] = set()
+    at = 0
+    for status in master_log.statuses:
+        while at < len(changes) and changes[at].stamp_ns <= status.stamp_ns:
+            if changes[at].event == begins:
+                inside.add(changes[at].station)
+            else:
+                inside.discard(changes[at].station)
+            at += 1
+        yield status, inside
+
+
+def _at_s(master_log: MasterLog, status: StatusRecord) -> float:
+    return (status.stamp_ns - master_log.unix_at_zero_ns) / 1e9

@@ -128,6 +128,16 @@ class FaultKind(StrEnum):
     """An instrument adds 34.4 mm, the constant of its prism, and the master, too, until the operator has found it."""
     SECOND_MASTER = "second-master"
     """Another master with the same key and stations is switched on beside the robot's."""
+    SHIMMER = "shimmer"
+    """The air over heated ground shimmers: angles and distances fluctuate, more at a longer range and at noon."""
+    RAIN = "rain"
+    """Weak returns: distances fail or are noisy, and locks are lost."""
+    SECOND_ROBOT = "second-robot"
+    """Another robot's prisms come into the field of view, and an instrument may follow one of them."""
+    WINDOW = "window"
+    """A reflecting surface: an instrument follows the image of its prism, or distances are too long by centimetres to metres."""
+    BATTERY_FADING = "battery-fading"
+    """An instrument's battery runs down: it measures and responds more slowly, dies, and gets another one from an operator."""
 
 
 # Further kinds come last: the draws of the others stay the same. Kinds from SLOW_DISK on have a generator each.
@@ -195,8 +205,14 @@ _RATES: Final = {
     FaultKind.NTP_SLEW: _FaultRate(4, _S, (2, 40)),
     **dict.fromkeys(SETUP_MISTAKES, _FaultRate(2, _S, (20, 120))),
     FaultKind.SECOND_MASTER: _FaultRate(4, _M, (5, 60)),
+    FaultKind.SHIMMER: _FaultRate(8, _M, (10, 100)),
+    FaultKind.RAIN: _FaultRate(8, _M, (10, 100)),
+    FaultKind.SECOND_ROBOT: _FaultRate(4, _S, (3, 40)),
+    FaultKind.WINDOW: _FaultRate(8, _S, (0.5, 20)),
+    FaultKind.BATTERY_FADING: _FaultRate(2, _S, (30, 150)),
 }
 
+_SWITCHED_ON: Final = frozenset({FaultKind.POWER, FaultKind.BATTERY_FADING})
 RATE_FACTOR = 3.0
 _OMIT_PROBABILITY = 0.3
 _RATE_SPREAD = 8.0
@@ -275,7 +291,7 @@ def draw_faults(
             if omitted and len(ordered) > 1:
                 continue
             for _ in range(count):
-                until_s = end_s - RELOCK_DELAY_S[1] if kind == FaultKind.POWER else end_s
+                until_s = end_s - RELOCK_DELAY_S[1] if kind in _SWITCHED_ON else end_s
                 at_s = rng.uniform(FAULT_FREE_START_S, max(FAULT_FREE_START_S, until_s))
                 shortest, longest = rate.duration_s
                 # Log-uniform durations.

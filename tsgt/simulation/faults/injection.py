@@ -12,6 +12,7 @@ import numpy as np
 
 from tsgt.simulation.faults.catalogue import RELOCK_DELAY_S, FaultKind
 from tsgt.simulation.faults.computers import COMPUTER_INJECTORS
+from tsgt.simulation.faults.optics import OPTICS_INJECTORS
 from tsgt.simulation.faults.setup_mistakes import MISTAKE_INJECTORS
 from tsgt.simulation.instrument import LineFault, Lock
 from tsgt.simulation.kernel import DriftingClock
@@ -343,4 +344,5 @@ _INJECTORS: Final[Mapping[FaultKind, Callable[[Mission, Fault, np.random.Generat
     FaultKind.VANISHING_READER: _vanishing_reader,
     **COMPUTER_INJECTORS,
     **MISTAKE_INJECTORS,
+    **OPTICS_INJECTORS,
 }

@@ -41,7 +41,7 @@ class EdmSchedule:
     def __init__(
         self, period_ns: int, jitter_ns: float, phase_ns: int, generator: np.random.Generator
     ) -> None:
-        self._period_ns = period_ns
+        self._usual_period_ns = self._period_ns = period_ns
         self._phase_ns = phase_ns
         limit_ns = 0.4 * period_ns  # keeps the measurements in order
         drawn = generator.normal(0.0, jitter_ns, _JITTER_COUNT).clip(-limit_ns, limit_ns)
@@ -71,6 +71,13 @@ class EdmSchedule:
         self.clear()
         self._single_ns = done_ns
 
+    def slow_down(self, factor: float, now_ns: int) -> None:
+        """Measure at this multiple of the usual interval from the newest instant on; 1: as usual."""
+        number = self._newest_number(now_ns)
+        period_ns = round(factor * self._usual_period_ns)
+        self._phase_ns += number * (self._period_ns - period_ns)
+        self._period_ns = period_ns
+
     def stop(self, now_ns: int) -> None:
         """Stop measuring; the last measurement stays."""
         if self._single_ns is not None and self._single_ns > now_ns:
@@ -90,10 +97,7 @@ class EdmSchedule:
             return None
         if self._to_ns is not None:
             now_ns = min(now_ns, self._to_ns)
-        number = (now_ns - self._phase_ns) // self._period_ns + 1
-        while self._tick(number) > now_ns:
-            number -= 1
-        tick_ns = self._tick(number)
+        tick_ns = self._tick(self._newest_number(now_ns))
         return tick_ns if tick_ns >= self._from_ns else None
 
     def next_after(self, now_ns: int) -> int | None:
@@ -107,6 +111,12 @@ class EdmSchedule:
         while self._tick(number) <= after_ns:
             number += 1
         return self._tick(number)
+
+    def _newest_number(self, now_ns: int) -> int:
+        number = (now_ns - self._phase_ns) // self._period_ns + 1
+        while self._tick(number) > now_ns:
+            number -= 1
+        return number
 
     def _tick(self, number: int) -> int:
         return self._phase_ns + number * self._period_ns + self._jitter_ns[number % _JITTER_COUNT]

@@ -21,6 +21,7 @@ from tsgt.simulation.instrument.edm import (
 )
 from tsgt.simulation.instrument.generations import GENERATIONS
 from tsgt.simulation.instrument.lock_drift import LockDrift
+from tsgt.simulation.instrument.optical_disturbances import PolarPoint
 from tsgt.simulation.instrument.settings import COMPENSATOR_SIGMA_RAD, PRISM_CONSTANTS_M, TAPE, Settings
 from tsgt.simulation.instrument.targets_in_view import TargetsInView, direction_to
 from tsgt.simulation.instrument.telescope import Telescope
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.config import ScenarioConfig, SimulatedStation
+    from tsgt.simulation.instrument.optical_disturbances import OpticalDisturbance
     from tsgt.simulation.instrument.targets_in_view import TargetObservation
     from tsgt.simulation.instrument.visibility import PolarDirection
     from tsgt.simulation.kernel import Timeline
@@ -100,6 +102,7 @@ class TotalStationModel:
         self._noise = noise(station.noise)
         self._reflector_m = station.prism_constant_mm / 1e3
         self._targets = TargetsInView(station, scenario, world)
+        self.disturbances: list[OpticalDisturbance] = []  # of the line of sight to any prism
         now_ns = timeline.now_ns()
         period_ns = round(1e9 / station.rate_hz)
         phase_ns = now_ns + int(generator.integers(period_ns))
@@ -295,6 +298,14 @@ class TotalStationModel:
             )
             horizontal += right_m / (distance_m * max(math.sin(zenith), 1e-3))
             zenith += down_m / distance_m
+        if seen.prism is not None:
+            for disturbance in self.disturbances:
+                disturbed = disturbance.apply(
+                    PolarPoint(horizontal, zenith, distance_m), self._world_s(at_ns)
+                )
+                if disturbed is None:
+                    return ReturnCode.TMC_ANGLE_OK
+                horizontal, zenith, distance_m = disturbed
         horizontal, zenith = self.circle_reading((horizontal, zenith))
         settings = self.settings
         reflectorless = settings.edm_mode == REFLECTORLESS or settings.target_type == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -18,12 +19,15 @@ if TYPE_CHECKING:
 
     from tsgt.config import ScenarioConfig, SimulatedStation
     from tsgt.simulation.instrument.telescope import Telescope
-    from tsgt.simulation.instrument.visibility import PolarDirection
+    from tsgt.simulation.instrument.visibility import PolarDirection, PrismTrack
     from tsgt.simulation.world import World
 
 BEAM_M: Final = 0.05
 BEAM_RAD: Final = 0.0005
 """Beam radius: a target within BEAM_M plus BEAM_RAD times the distance of the line of sight reflects."""
+
+FOREIGN_PRISMS: Final = 1000
+"""Targets with higher numbers are no prisms of the robot."""
 
 FAULT_CODES: Final = {
     "tilt": ReturnCode.TMC_ANGLE_OK,
@@ -60,17 +64,26 @@ class TargetsInView:
         spans_s += [[fault.start_s, fault.end_s] for fault in faults if fault.status == "no_target"]
         occluded_s = [(from_s, to_s) for from_s, to_s in spans_s]
         self.prisms = {
-            prism.prism: PrismVisibility(station, world, row, occluded_s)
+            prism.prism: PrismVisibility(station, partial(_prism_at, world, row), occluded_s, prism.prism)
             for row, prism in enumerate(scenario.prisms)
         }
+        self._station = station
         self._foils_m = scenario.targets_m
         self.foils = self._foils_from(station)  # foil targets in the frame of the station, each (3,) in m
 
     def move(self, station: SimulatedStation) -> None:
         """See everything from where this station says, and as the world is from now on."""
+        self._station = station
         self.foils = self._foils_from(station)
         for visibility in self.prisms.values():
             visibility.move(station)
+
+    def add(self, track: PrismTrack, from_s: float, to_s: float, target_id: int) -> int:
+        """Add another prism, or its image in a mirror, that is in sight for a while; return its number here."""
+        number = max(*self.prisms, FOREIGN_PRISMS) + 1
+        hidden_s = ((-math.inf, from_s), (to_s, math.inf))
+        self.prisms[number] = PrismVisibility(self._station, track, hidden_s, target_id)
+        return number
 
     def _foils_from(self, station: SimulatedStation) -> list[NDArray[np.float64]]:
         T_station_station1 = invert(np.array(level_frame(station)))
@@ -143,11 +156,16 @@ class TargetsInView:
             horizontal, zenith = visibility.direction_at(world_s)
             until_rad = math.copysign(1.0, turn_rad) * (horizontal - start_rad) % math.tau
             inside = until_rad <= abs(turn_rad) and abs(zenith - height_rad[0]) <= height_rad[1]
-            if inside and target_id in (None, prism) and not visibility.lost_at(world_s):
+            if inside and target_id in (None, visibility.target_id) and not visibility.lost_at(world_s):
                 distance_m = float(np.linalg.norm(visibility.point_at(world_s)))
                 if range_m[0] <= distance_m <= range_m[1]:
                     met.append((until_rad, prism))
         return (min(met)[1], min(met)[0]) if met else None
+
+
+def _prism_at(world: World, row: int, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the track of a prism of the robot, which rests before and after the world's duration."""
+    return world.prism_at(np.minimum(np.maximum(times_s, 0.0), world.duration_s), row)
 
 
 def direction_to(point: NDArray[np.float64]) -> PolarDirection:

@@ -98,6 +98,17 @@ class Telescope:
         self.locked_s = None if self.prism is None else self._now_s
         self.lock, self.prism = Lock.IN, prism
 
+    def take_over(self, prism: int) -> bool:
+        """Follow another prism instead of the present one if that is in the field of view; return whether it does."""
+        visibility = self._prisms[prism]
+        if self.lock is not Lock.IN or self.blocked or visibility.lost_at(self._now_s):
+            return False
+        apart = angular_separation_rad(visibility.direction_at(self._now_s), self.direction())
+        if max(apart) > self.field_rad:
+            return False
+        self.follow(prism)
+        return True
+
     def nearest_prism(self, across_rad: float, up_rad: float) -> int | None:
         """Return the visible prism nearest to the line of sight within a window of this half width and height.
 
@@ -108,7 +119,7 @@ class Telescope:
         here = self.direction()
         least, found = math.inf, None
         for prism, visibility in self._prisms.items():
-            if self.target_id not in (None, prism) or visibility.lost_at(self._now_s):
+            if self.target_id not in (None, visibility.target_id) or visibility.lost_at(self._now_s):
                 continue
             across, up = angular_separation_rad(visibility.direction_at(self._now_s), here)
             if across <= max(across_rad, self.field_rad) and up <= max(up_rad, self.field_rad):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.config import ScenarioConfig, SimulatedStation
+    from tsgt.simulation.instrument.visibility import PrismTrack
     from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.world import World
 
@@ -111,6 +112,20 @@ class SimulatedTotalStation(TotalStationModel):
         self.settings.atr = self.settings.lock = True
         self._select_target(prism)
         self.telescope.follow(prism)
+
+    def add_prism(self, track: PrismTrack, from_s: float, to_s: float, target_id: int) -> int:
+        """Add a prism that is not the robot's, in sight from one time to another, in s from the start; return its number here."""
+        return self._targets.add(track, from_s, to_s, target_id)
+
+    def take_over(self, prism: int) -> bool:
+        """Let a prism take the lock if it is in the field of view of a locked telescope; return whether it has taken it."""
+        self.advance()
+        return self.telescope.take_over(prism)
+
+    def slow_down(self, factor: float) -> None:
+        """Measure and respond this many times slower than usual."""
+        self.edm.slow_down(factor, self.advance())
+        self.server.processing_factor = factor
 
     def set_up_at(self, station: SimulatedStation) -> None:
         """Stand where this station says from now on, as if somebody had moved the tripod; the lock remains."""

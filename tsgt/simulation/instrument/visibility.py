@@ -11,12 +11,11 @@ from tsgt.config import level_frame
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from tsgt.config import SimulatedStation
-    from tsgt.simulation.world import World
 
 STEP_S = 0.02
 """Time resolution of the trackability test."""
@@ -44,20 +43,27 @@ _SERVO_LOOKAHEAD_STEPS = round(SERVO_LOOKAHEAD_S / STEP_S)
 PolarDirection = tuple[float, float]
 """Horizontal and zenith angle in rad."""
 
+if TYPE_CHECKING:
+    PrismTrack = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    """Positions of a prism in ``station1``, (N, 3) in m, at N instants in s from the start of the world."""
+
 
 class PrismVisibility:
-    """One prism as one station sees it, computed in blocks on request; at rest before and after the world's duration."""
+    """One prism as one station sees it, computed in blocks on request.
+
+    ``target_id``: the number by which an instrument recognises it, if the prisms are active ones.
+    """
 
     def __init__(
         self,
         station: SimulatedStation,
-        world: World,
-        row: int,
+        track: PrismTrack,
         occluded_s: Sequence[tuple[float, float]],
+        target_id: int,
     ) -> None:
-        self._world = world
-        self._row = row
+        self._track = track
         self._occluded_s = occluded_s
+        self.target_id = target_id
         self._T_station_station1 = invert(np.array(level_frame(station)))
         self._blocks: dict[int, _Block] = {}
 
@@ -109,8 +115,7 @@ class PrismVisibility:
         return None
 
     def _points(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        inside_s = np.minimum(np.maximum(times_s, 0.0), self._world.duration_s)
-        return transform_points(self._T_station_station1, self._world.prism_at(inside_s, self._row))
+        return transform_points(self._T_station_station1, self._track(times_s))
 
     def _block(self, step: int) -> _Block:
         number = step // _BLOCK

@@ -251,6 +251,30 @@ def test_events_of_lost_stations(tmp_path: Path, heard_s: float, events: tuple[s
     assert len(list(event_failures(log, superframe=True))) == count
 
 
+@pytest.mark.parametrize(
+    ("percent", "events", "count"),
+    [
+        (None, (), 0),
+        (20, (), 0),
+        (19, (), 1),
+        (19, ("battery_low",), 0),
+        (29, ("battery_low",), 0),
+        (30, ("battery_low",), 1),
+        (30, ("battery_low", "battery_recovered"), 0),
+    ],
+)
+def test_events_of_a_low_battery(
+    tmp_path: Path, percent: int | None, events: tuple[str, ...], count: int
+) -> None:
+    """Low below 20 %, and no longer from 30 % on."""
+    log = _log(
+        tmp_path,
+        *(replace(EVENT, event=event, station=1, stamp_ns=START) for event in events),
+        _status(battery_percent=percent),
+    )
+    assert len(list(event_failures(log, superframe=True))) == count
+
+
 @pytest.mark.parametrize(("age_s", "count"), [(0.05, 0), (0.0, 1), (0.45, 1), (None, 1)])
 def test_pose_with_a_wrong_age(tmp_path: Path, age_s: float | None, count: int) -> None:
     """The last measurement is 0.05 s before the pose."""

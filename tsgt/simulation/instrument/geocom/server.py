@@ -70,6 +70,7 @@ class GeoComServer:
         self._timeline = timeline
         self._rng = generator
         self._processing_ms = model.processing_min_ms, model.processing_max_ms
+        self.processing_factor = 1.0  # by which processing takes longer than usual
         self._stalls_per_min = model.stalls_per_min
         self._next_stall_ns = self._draw_stall()
         self._buffer = b""
@@ -181,7 +182,7 @@ class GeoComServer:
         """Send a response after the processing time."""
         self._job = None
         now_ns = self._timeline.now_ns()
-        processing_ms = self._rng.uniform(*self._processing_ms)
+        processing_ms = self._rng.uniform(*self._processing_ms) * self.processing_factor
         if now_ns >= self._next_stall_ns:
             processing_ms = self._rng.uniform(*STALL_S) * 1e3
             self._next_stall_ns = self._draw_stall()

@@ -11,7 +11,7 @@ import numpy as np
 from tsgt.config import level_frame
 from tsgt.geometry import cartesian_to_polar, invert, transform_points
 from tsgt.simulation.instrument.telescope import Lock
-from tsgt.simulation.instrument.visibility import PrismVisibility, angular_separation_rad
+from tsgt.simulation.instrument.visibility import STEP_S, PrismVisibility, angular_separation_rad
 from tsgt.station.geocom import ReturnCode
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class TargetsInView:
     def add(self, track: PrismTrack, from_s: float, to_s: float, target_id: int) -> int:
         """Add another prism, or its image in a mirror, that is in sight for a while; return its number here."""
         number = max(*self.prisms, FOREIGN_PRISMS) + 1
-        hidden_s = ((-math.inf, from_s), (to_s, math.inf))
+        hidden_s = ((-math.inf, from_s - STEP_S), (to_s, math.inf))  # in sight at once, whatever the step
         self.prisms[number] = PrismVisibility(self._station, track, hidden_s, target_id)
         return number
 

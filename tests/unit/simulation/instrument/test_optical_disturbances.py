@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import numpy as np
@@ -105,17 +106,18 @@ async def test_disturbed_instrument_reports_what_the_disturbance_leaves() -> Non
     assert replies[-1].values[6] == clear[6]
 
 
-def _other(bench: Bench, *, ahead_m: float, to_s: float) -> int:
+def _other(bench: Bench, *, ahead_m: float, from_s: float, to_s: float) -> int:
     """Add a prism of somebody else's in line with that of station 1, farther away by this."""
     own = bench.world.prism_at(np.array([0.0]), 0)[0]
     place = own * (1 + ahead_m / np.linalg.norm(own))
-    return bench.instrument.add_prism(lambda times_s: np.tile(place, (len(times_s), 1)), 0.0, to_s, 1)
+    return bench.instrument.add_prism(lambda times_s: np.tile(place, (len(times_s), 1)), from_s, to_s, 1)
 
 
 async def test_another_robots_prism_takes_the_lock_and_keeps_it() -> None:
     """Until it is out of sight; then the instrument finds its own prism, which is still in the field of view."""
     bench = Bench(with_station(noise=SILENT))
-    other = _other(bench, ahead_m=5.0, to_s=20.0)
+    await asyncio.sleep(0.75)
+    other = _other(bench, ahead_m=5.0, from_s=0.75, to_s=20.0)
     assert bench.instrument.take_over(other)
     await bench.do(*SETUP)
     while bench.timeline.now_ns() < 40e9:

@@ -3,6 +3,9 @@
 The distance of a prism from the centroid of others follows from the layout, however the robot is oriented. So points
 that other stations measured within the last second give a direction, and the layout the spread of the prism about it; the
 robot's speed adds to the spread. Nothing is assumed about the robot's orientation.
+
+A station that follows a prism of another robot, or a mirror image, measures on: its points are farther from those of the
+others than the layout allows. It gets a direction, too, if the others agree and it has agreed with them before.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +24,7 @@ from tsgt.model import PolarMeasurement, Status
 from tsgt.radio import Direction
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -54,6 +58,17 @@ START_ALLOWANCE_M = 0.5  # a stationary robot may start: 1 m/s^2 within a second
 
 MAX_SPREAD_RAD = math.radians(45.0)  # a direction with a larger spread is useless: the robot is too near
 
+MAX_MISMATCH_M = 0.5
+"""By more than this the distance of two points from each other differs from the layout's only if one is of another target: the
+points are predicted by up to a second, and the robot may turn."""
+
+MIN_WITNESSES = 2
+"""Two points alone that do not fit do not tell whose is wrong."""
+
+MAX_TARGET_HINTS = 2
+"""Directions for a station that measures another target. More are useless if that is in the same direction, and harmful if
+the station's tripod was moved: each may cost it the lock."""
+
 _LOST = (Status.NO_TARGET, Status.ANGLE_ONLY)
 
 
@@ -64,6 +79,8 @@ class _Station:
     prism: int
     newest_ns: int = 0
     lost_ns: int | None = None  # when its instrument lost the prism; None while it has it
+    astray_ns: int | None = None  # since when its points are not of its prism; None: they may be
+    has_agreed: bool = False  # whether its points have fitted those of others
     second_face: bool = False
     points: deque[PolarMeasurement] = field(default_factory=lambda: deque(maxlen=POINT_HISTORY_CAPACITY))
     hint: Direction | None = None
@@ -83,6 +100,8 @@ class ReacquisitionHints:
         self._parameters = parameters
         self._frames = {station.station: station for station in parameters.stations}
         self._layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
+        for station in self._stations.values():
+            station.has_agreed = False
 
     def measured(self, measurement: PolarMeasurement) -> None:
         """Take a measurement; those of a station arrive in any order."""
@@ -101,14 +120,17 @@ class ReacquisitionHints:
                 station.lost_ns = at_ns
             if usable:
                 station.second_face = measurement.zenith_angle_rad > math.pi
-                station.hint, station.hint_ns, station.hints = None, None, 0
+                self._judge_target(measurement.station, at_ns)
+                if station.astray_ns is None:
+                    station.hint, station.hint_ns, station.hints = None, None, 0
         elif usable and station.lost_ns is not None:  # a late one: the prism was found and lost again
             station.lost_ns = max(station.lost_ns, at_ns)
 
     def direction(self, number: int, now_ns: int) -> Direction | None:
         """Return where to search, the same object for 5 s (another is a new command); None: no hint. Master's Unix clock."""
         station = self._stations[number]
-        if station.lost_ns is None or now_ns - station.lost_ns <= HINT_DELAY_NS:
+        since_ns = min((ns for ns in (station.lost_ns, station.astray_ns) if ns is not None), default=now_ns)
+        if now_ns - since_ns <= HINT_DELAY_NS:
             return None
         if self._parameters.no_poses is not None:
             return None
@@ -116,6 +138,9 @@ class ReacquisitionHints:
             since_ns = now_ns - station.hint_ns
             if since_ns < HINT_INTERVAL_NS:
                 return station.hint
+            if station.lost_ns is None and station.hints >= MAX_TARGET_HINTS:
+                station.astray_ns, station.has_agreed = None, False
+                return None
             if since_ns < SLOW_HINT_INTERVAL_NS and station.hints >= MAX_FREQUENT_HINTS:
                 return None
         station.hint = self._compute(number, station, now_ns)
@@ -124,8 +149,43 @@ class ReacquisitionHints:
             station.hints += 1
         return station.hint
 
+    def _judge_target(self, number: int, now_ns: int) -> None:
+        """Take whether the newest point of a station fits those of the others, if two or more of these fit each other."""
+        points = {
+            other: found[0]
+            for other, station in self._stations.items()
+            if (found := self._predicted(station, now_ns)) is not None
+        }
+        others = [other for other in points if other != number]
+        station = self._stations[number]
+        if (
+            number not in points
+            or len(others) < MIN_WITNESSES
+            or not all(self._fit(points, one, other) for one, other in combinations(others, 2))
+        ):
+            station.astray_ns = None
+        elif any(self._fit(points, number, other) for other in others):
+            station.has_agreed, station.astray_ns = True, None
+        elif station.has_agreed and station.astray_ns is None:
+            station.astray_ns = now_ns
+
+    def _predicted(
+        self, station: _Station, now_ns: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Return where a station sees its prism now, and its velocity."""
+        tracks = build_tracks(self._parameters, self._recent_of(station, now_ns))
+        return _position_and_velocity(tracks[station.prism], now_ns)
+
+    def _fit(self, points: Mapping[int, NDArray[np.float64]], one: int, other: int) -> bool:
+        """Whether the points of two stations are as far apart as their prisms."""
+        layout_m = self._layout[self._stations[one].prism] - self._layout[self._stations[other].prism]
+        apart_m = np.linalg.norm(points[one] - points[other]) - np.linalg.norm(layout_m)
+        return bool(abs(apart_m) <= MAX_MISMATCH_M)
+
     def _compute(self, number: int, station: _Station, now_ns: int) -> Direction | None:
-        tracks = build_tracks(self._parameters, self._recent(now_ns))
+        seeing = (other for other in self._stations.values() if other.astray_ns is None)
+        recent = [point for other in seeing for point in self._recent_of(other, now_ns)]
+        tracks = build_tracks(self._parameters, recent)
         known = {
             prism: found
             for prism, track in tracks.items()
@@ -148,9 +208,8 @@ class ReacquisitionHints:
             horizontal_rad, zenith_rad = (horizontal_rad + math.pi) % math.tau, math.tau - zenith_rad
         return Direction(horizontal_rad, zenith_rad, math.asin(spread_m / distance_m))
 
-    def _recent(self, now_ns: int) -> Iterable[PolarMeasurement]:
-        for station in self._stations.values():
-            yield from (point for point in station.points if point.stamp_ns > now_ns - POINT_HISTORY_NS)
+    def _recent_of(self, station: _Station, now_ns: int) -> list[PolarMeasurement]:
+        return [point for point in station.points if point.stamp_ns > now_ns - POINT_HISTORY_NS]
 
 
 def _position_and_velocity(

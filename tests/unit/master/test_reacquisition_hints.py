@@ -284,6 +284,70 @@ def test_reacquired_prism_ends_the_hints() -> None:
     assert again is not first
 
 
+def _follow_another_robot(
+    hints: ReacquisitionHints, scene: Scene, *, since_s: float, until_s: float, away_m: float
+) -> None:
+    """Let the second station follow a prism that is nearer than its own by this."""
+    for step in range(math.ceil(since_s / STEP_S), math.ceil(until_s / STEP_S)):
+        for station in (1, 2, 3):
+            measured = scene.measure(station, STEP_S * step + 0.01 * station)
+            if station == 2:
+                turned_rad = measured.horizontal_angle_rad + away_m / 38
+                measured = replace(measured, horizontal_angle_rad=turned_rad)
+            hints.measured(measured)
+
+
+def test_station_on_another_robots_prism_gets_a_hint() -> None:
+    """Where the others see the robot, while they agree; the hint stays for as long as any, and two are enough."""
+    scene = stationary_scene()
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, until_s=LOST_S)
+    _follow_another_robot(hints, scene, since_s=LOST_S, until_s=11.5, away_m=4.0)
+    assert hints.direction(2, ns(11.5)) is None
+    _follow_another_robot(hints, scene, since_s=11.6, until_s=12.5, away_m=4.0)
+    towards = hints.direction(2, ns(12.5))
+    assert towards is not None
+    assert beside_rad(scene, towards, 12.5) < towards.spread_rad
+    assert hints.direction(1, ns(12.5)) is hints.direction(3, ns(12.5)) is None
+    _follow_another_robot(hints, scene, since_s=12.8, until_s=13.3, away_m=4.0)
+    assert hints.direction(2, ns(13.3)) is towards
+    _follow_another_robot(hints, scene, since_s=13.6, until_s=40.0, away_m=4.0)
+    second = hints.direction(2, ns(40.0))
+    assert second is not None
+    assert second is not towards
+    _follow_another_robot(hints, scene, since_s=40.0, until_s=80.0, away_m=4.0)
+    assert hints.direction(2, ns(80.0)) is None
+
+
+@pytest.mark.parametrize(("agreed_until_s", "away_m"), [(LOST_S, 0.3), (0.0, 4.0)])
+def test_station_that_never_fitted_or_nearly_fits_gets_no_hint(agreed_until_s: float, away_m: float) -> None:
+    """A wrong frame is no reason to release a prism, and neither is what a turning robot leaves uncertain."""
+    scene = stationary_scene()
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, until_s=agreed_until_s)
+    _follow_another_robot(hints, scene, since_s=agreed_until_s, until_s=20.0, away_m=away_m)
+    assert hints.direction(2, ns(20.0)) is None
+
+
+def test_own_prism_after_another_robots_ends_the_hints() -> None:
+    """One measurement that fits is enough."""
+    scene = stationary_scene()
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, until_s=LOST_S)
+    _follow_another_robot(hints, scene, since_s=LOST_S, until_s=12.5, away_m=4.0)
+    assert hints.direction(2, ns(12.5)) is not None
+    watch(hints, scene, since_s=12.8, until_s=13.3, sees=lambda _station, _time_s: Status.OK)
+    assert hints.direction(2, ns(13.3)) is None
+
+
+def test_driving_robot_is_no_other_robot() -> None:
+    """Stations measure at different times, and the robot turns."""
+    scene = stationary_scene().moving(driving)
+    hints = ReacquisitionHints(scene.parameters)
+    watch(hints, scene, until_s=20.0, sees=lambda _station, _time_s: Status.OK)
+    assert all(hints.direction(station, ns(20.0)) is None for station in (1, 2, 3))
+
+
 def test_late_measurements_are_ordered_by_time() -> None:
     """One from before the loss changes nothing; one from within it shows that the prism was there."""
     scene = stationary_scene()

@@ -32,7 +32,6 @@ _LOCK_LOSSES_HZ: Final = 0.05  # by drops on the optics, in the heaviest rain
 _LOCK_LOSS_S: Final = (0.1, 3.0)
 
 _ROBOTS_APART_M: Final = (2.0, 8.0)
-_TAKE_OVER_PROBABILITY: Final = 0.7
 
 _MULTIPATH_M: Final = (0.01, 3.0)
 _MIRROR_M: Final = (0.1, 3.0)  # from the prism to the reflecting surface
@@ -117,7 +116,7 @@ async def _second_robot(mission: Mission, fault: Fault, rng: np.random.Generator
             each.prism: instrument.add_prism(partial(track, each.position_m), fault.at_s, until_s, each.prism)
             for each in mission.parameters.prisms
         }
-        if number == station and rng.random() < _TAKE_OVER_PROBABILITY:
+        if number == station:
             instrument.take_over(added[mission.prisms[station]])
     await asyncio.sleep(fault.duration_s)
 

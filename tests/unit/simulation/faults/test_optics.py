@@ -6,6 +6,7 @@ import asyncio
 from collections import Counter
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from harness.missions import SUPERFRAME, run_mission
 
@@ -17,6 +18,8 @@ from tsgt.simulation.scenario_files import find_scenario
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from tsgt.simulation.mission import Mission, MissionResult
 
@@ -60,6 +63,29 @@ def test_other_robot_takes_the_lock_for_a_while(tmp_path: Path) -> None:
 
     result = _run(tmp_path, meet, AT_S + 15.0)
     assert followed[0] not in (1, 2, 3)
+    assert {violation.check for violation in check_invariants(result, replay=False)} <= {"liveness"}
+
+
+@pytest.mark.slow
+def test_station_that_follows_another_robot_is_called_back(tmp_path: Path) -> None:
+    """It drives away from the line of sight and stays in view: the master sends a direction that ends the lock."""
+
+    async def part(mission: Mission) -> None:
+        await mission.sleep_until(AT_S)
+        instrument = mission.instruments[1]
+        begin = mission.world.prism_at(np.array([AT_S]), 0)[0]
+
+        def track(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+            away_m = np.clip(1.5 * (times_s - AT_S), 0.0, 12.0)
+            return begin + away_m[:, None] * np.array([-0.6, 0.8, 0.0])
+
+        assert instrument.take_over(instrument.add_prism(track, AT_S, 99.0, 1))
+        await mission.sleep_until(AT_S + 5.0)
+        assert instrument.telescope.prism not in mission.prisms.values()
+        await mission.sleep_until(AT_S + 16.0)
+        assert (instrument.telescope.lock, instrument.telescope.prism) == (Lock.IN, 1)
+
+    result = _run(tmp_path, part, AT_S + 17.0)
     assert {violation.check for violation in check_invariants(result, replay=False)} <= {"liveness"}
 
 

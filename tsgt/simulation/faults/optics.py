@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.instrument.optical_disturbances import OpticalDisturbance
     from tsgt.simulation.mission import Mission
 
-_NOON_STRUCTURE: Final = (1e-13, 2e-12)
+_NOON_STRUCTURE: Final = (1e-13, 1e-12)
 _HOURS: Final = (8.0, 18.0)
 _CORRELATION_S: Final = (0.2, 0.6)
 
@@ -38,12 +38,15 @@ _MIRROR_M: Final = (0.1, 3.0)  # from the prism to the reflecting surface
 
 _SLOWEST: Final = 4.0
 _DEAD_SHARE: Final = 0.2
+_NEARLY_EMPTY_PERCENT: Final = (15.0, 35.0)
 _EMPTY_PERCENT: Final = 2.0
 _NEW_PERCENT: Final = 95.0
 _FADING_STEP_S: Final = 1.0
 
 
 async def _shimmer(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
+    if _is_disturbed_by(HeatShimmer, mission):
+        return
     noon, hour, correlation_s = (
         _log_uniform(rng, _NOON_STRUCTURE),
         rng.uniform(*_HOURS),
@@ -57,6 +60,8 @@ async def _shimmer(mission: Mission, fault: Fault, rng: np.random.Generator) -> 
 
 
 async def _rain(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
+    if _is_disturbed_by(Rain, mission):
+        return
     rate_mmph = _log_uniform(rng, _RAIN_MMPH)
     generators = rng.spawn(len(mission.instruments))
     drops = [
@@ -81,6 +86,15 @@ async def _lose_locks(
         await asyncio.sleep(hidden_s)
         instrument.blocked = False
         left_s -= until_s + hidden_s
+
+
+def _is_disturbed_by(weather: type, mission: Mission) -> bool:
+    """Whether there is such weather already: it does not add up."""
+    return any(
+        isinstance(each, weather)
+        for instrument in mission.instruments.values()
+        for each in instrument.disturbances
+    )
 
 
 async def _disturb_all(mission: Mission, fault: Fault, disturbances: Sequence[OpticalDisturbance]) -> None:
@@ -148,9 +162,12 @@ async def _window(mission: Mission, fault: Fault, rng: np.random.Generator) -> N
 async def _battery_fading(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     number = _station(fault)
     instrument = mission.instruments[number]
-    full_percent, fades_s = instrument.battery_percent, (1 - _DEAD_SHARE) * fault.duration_s
+    begin_percent = rng.uniform(*_NEARLY_EMPTY_PERCENT)
+    fades_s = max((1 - _DEAD_SHARE) * fault.duration_s, _FADING_STEP_S)
+    if instrument.battery_percent < begin_percent:
+        return  # another one of its batteries runs down
     while instrument.on and (share := (mission.now_s - fault.at_s) / fades_s) < 1.0:
-        instrument.battery_percent = full_percent + share * (_EMPTY_PERCENT - full_percent)
+        instrument.battery_percent = begin_percent + share * (_EMPTY_PERCENT - begin_percent)
         instrument.slow_down(_SLOWEST**share)
         await asyncio.sleep(_FADING_STEP_S)
     instrument.switch_off()

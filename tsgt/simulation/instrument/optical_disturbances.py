@@ -116,7 +116,7 @@ FADING_DB: Final = 6.0
 MISSED_SHARE: Final = 0.25
 """Share of the distances that fail in the heaviest rain at any range, when a drop runs over the optics; an assumption."""
 
-RAIN_SIGMA_M: Final = 0.004
+RAIN_SIGMA_M: Final = 0.002
 """One sigma of additional noise across and along the line of sight in the heaviest rain; an assumption."""
 
 HEAVY_RAIN_MMPH: Final = 50.0

@@ -91,7 +91,7 @@ def test_station_that_follows_another_robot_is_called_back(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_battery_runs_down_and_is_changed(tmp_path: Path) -> None:
-    """The measurements become fewer, then there are none; with the new battery there are as many as before."""
+    """Fewer measurements, an event, then none; with the new battery there are as many as before."""
 
     async def fade(mission: Mission) -> None:
         await inject_fault(mission, _fault(FaultKind.BATTERY_FADING, 30.0))

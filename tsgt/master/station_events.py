@@ -22,13 +22,16 @@ IDLE_TIMEOUT_NS = 10_000_000_000
 CHARGED_BATTERY_PERCENT = LOW_BATTERY_PERCENT + 10
 """A low battery is low until it has this again: changed, or charged."""
 
+NO_DISTANCE_NS = 2_000_000_000
+"""An instrument that measures angles without distances for this long has an event: in rain single distances fail."""
+
 CLOCK_STEP_THRESHOLD_NS = 100_000_000
 """A change of the offset between the machine's Unix clock and the master's timeline that counts as a step."""
 
 _MEANING = {
     Status.OK: "measures",
     Status.LOW_ACCURACY: "measures",
-    Status.ANGLE_ONLY: "measures angles without a distance; the prism may be nearer than 1 m",
+    Status.ANGLE_ONLY: "measures angles without distances; the prism may be nearer than 1 m, or the return is weak",
     Status.NO_TARGET: "has no prism, or reports another error",
     Status.TILT: "is not levelled",
     Status.WRONG_DISTANCE: "reports a wrong distance; it may be on the wrong prism",
@@ -51,6 +54,8 @@ class _Station:
     idle: bool = False
     battery_low: bool = False
     meaning: str = _MEANING[Status.OK]
+    no_distance_since_ns: int | None = None
+    """Stamp of the first measurement of angles without a distance; None after any other."""
     newest: tuple[int, int] = (-1, 0)  # sequence number and stamp of the newest measurement
 
 
@@ -151,6 +156,13 @@ class StationEventDetector:
             return events
         found.newest = (measurement.sequence, measurement.stamp_ns)
         meaning = _MEANING[measurement.status]
+        if measurement.status is not Status.ANGLE_ONLY:
+            found.no_distance_since_ns = None
+        elif found.no_distance_since_ns is None:
+            found.no_distance_since_ns = measurement.stamp_ns
+        since_ns = found.no_distance_since_ns
+        if since_ns is not None and measurement.stamp_ns - since_ns < NO_DISTANCE_NS:
+            return events
         if meaning != found.meaning:
             found.meaning = meaning
             again = " again" if measurement.status.usable else ""

@@ -115,6 +115,18 @@ def test_repeated_error_is_not_idle() -> None:
     assert [e for second in range(60) for e in detector.reply(1, START + second * SECOND)] == []
 
 
+def test_single_missed_distances_are_no_events() -> None:
+    """As in rain; angles without distances for two seconds are one event, and the next distance another."""
+    detector = StationEventDetector([1], START)
+    rain = [Status.OK, Status.ANGLE_ONLY, Status.ANGLE_ONLY, Status.OK, Status.ANGLE_ONLY, Status.OK]
+    near = [Status.ANGLE_ONLY] * 4 + [Status.OK]
+    times = []
+    for second, status in enumerate(rain + near):
+        found = replace(measurement(second), status=status, stamp_ns=START + second * SECOND)
+        times += [second for _ in detector.measurement(found, START + second * SECOND)]
+    assert times == [8, 10]
+
+
 def test_late_status_is_no_event() -> None:
     """It is out of date."""
     detector = StationEventDetector([1], START)

@@ -27,6 +27,10 @@ LOW_BATTERY_PERCENT, CHARGED_BATTERY_PERCENT = 20, 30
 """Below the first a battery is low, from the second on it no longer is."""
 
 
+NO_DISTANCE_NS = 2_000_000_000
+"""Angles without a distance are an event if they last this long."""
+
+
 def event_failures(master_log: MasterLog, *, superframe: bool) -> Iterator[str]:
     """Yield the stations of which events are missing, or were not called for."""
     events = Counter((event.station, event.event) for event in master_log.events)
@@ -42,6 +46,7 @@ def _status_changes(master_log: MasterLog) -> Counter[int]:
     """Return how often each station's instrument has changed its status; usable ones count as one."""
     newest: dict[int, tuple[int, int]] = {}
     last: dict[int, Status] = {}
+    without_distance_ns: dict[int, int] = {}  # since when
     changes: Counter[int] = Counter()
     for measurement in master_log.measurements:
         station = measurement.station
@@ -50,6 +55,13 @@ def _status_changes(master_log: MasterLog) -> Counter[int]:
         if measurement.sequence < sequence and measurement.stamp_ns < stamp_ns:
             continue  # a backlog: out of date
         newest[station] = measurement.sequence, measurement.stamp_ns
+        if measurement.status is not Status.ANGLE_ONLY:
+            without_distance_ns.pop(station, None)
+        elif (
+            without_distance_ns.setdefault(station, measurement.stamp_ns)
+            > measurement.stamp_ns - NO_DISTANCE_NS
+        ):
+            continue
         status = Status.OK if measurement.status.usable else measurement.status
         changes[station] += status != last.get(station, Status.OK)
         last[station] = status

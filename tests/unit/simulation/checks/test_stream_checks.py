@@ -217,6 +217,9 @@ def test_outstanding_measurements_are_counted(tmp_path: Path, stated: int, count
         ((Status.OK, Status.TILT), 0, 1),
         ((Status.OK, Status.TILT, Status.TILT, Status.OK), 2, 0),
         ((Status.OK, Status.OK), 1, 1),
+        ((Status.OK, Status.ANGLE_ONLY, Status.OK), 0, 0),
+        ((Status.OK, *[Status.ANGLE_ONLY] * 6, Status.OK), 2, 0),
+        ((Status.OK, *[Status.ANGLE_ONLY] * 6, Status.OK), 0, 1),
     ],
 )
 def test_events_of_an_instruments_status(

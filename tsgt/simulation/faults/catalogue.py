@@ -235,7 +235,15 @@ ODOMETRY_FAULTS: Final = frozenset(kind for kind, rate in _RATES.items() if rate
 """Kinds of faults that only a robot with wheel odometry has."""
 
 
-FIELD_DAY_FAULTS: Final = frozenset({FaultKind.NTP_SLEW, *SETUP_MISTAKES, FaultKind.SECOND_MASTER})
+FIELD_DAY_FAULTS: Final = frozenset(
+    {
+        FaultKind.NTP_SLEW,
+        *SETUP_MISTAKES,
+        FaultKind.SECOND_MASTER,
+        FaultKind.SECOND_ROBOT,
+        FaultKind.WINDOW,
+    }
+)
 """Kinds that are injected by name only: what they violate is bounded, or they need a mission of their own."""
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.instrument.optical_disturbances import OpticalDisturbance
     from tsgt.simulation.mission import Mission
 
-_NOON_STRUCTURE: Final = (1e-13, 1e-12)
+_NOON_STRUCTURE: Final = (1e-13, 6e-13)
 _HOURS: Final = (8.0, 18.0)
 _CORRELATION_S: Final = (0.2, 0.6)
 

@@ -11,7 +11,7 @@ others than the layout allows. It gets a direction, too, if the others agree and
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -65,6 +65,8 @@ points are predicted by up to a second, and the robot may turn."""
 MIN_WITNESSES = 2
 """Two points alone that do not fit do not tell whose is wrong."""
 
+JUDGEMENT_INTERVAL_NS = 400_000_000  # about a frame
+
 MAX_TARGET_HINTS = 2
 """Directions for a station that measures another target. More are useless if that is in the same direction, and harmful if
 the station's tripod was moved: each may cost it the lock."""
@@ -93,6 +95,7 @@ class ReacquisitionHints:
 
     def __init__(self, parameters: Parameters) -> None:
         self._stations = {station.station: _Station(station.prism) for station in parameters.stations}
+        self._judged_ns = 0
         self.set_up(parameters)
 
     def set_up(self, parameters: Parameters) -> None:
@@ -120,7 +123,7 @@ class ReacquisitionHints:
                 station.lost_ns = at_ns
             if usable:
                 station.second_face = measurement.zenith_angle_rad > math.pi
-                self._judge_target(measurement.station, at_ns)
+                self._judge_targets(at_ns)
                 if station.astray_ns is None:
                     station.hint, station.hint_ns, station.hints = None, None, 0
         elif usable and station.lost_ns is not None:  # a late one: the prism was found and lost again
@@ -149,32 +152,29 @@ class ReacquisitionHints:
             station.hints += 1
         return station.hint
 
-    def _judge_target(self, number: int, now_ns: int) -> None:
-        """Take whether the newest point of a station fits those of the others, if two or more of these fit each other."""
+    def _judge_targets(self, now_ns: int) -> None:
+        """Take which stations' points fit those of the others, if two or more of these fit each other."""
+        if 0 <= now_ns - self._judged_ns < JUDGEMENT_INTERVAL_NS:
+            return
+        self._judged_ns = now_ns
+        recent = [point for station in self._stations.values() for point in self._recent_of(station, now_ns)]
+        tracks = build_tracks(self._parameters, recent)
+        prisms = Counter(station.prism for station in self._stations.values())
         points = {
-            other: found[0]
-            for other, station in self._stations.items()
-            if (found := self._predicted(station, now_ns)) is not None
+            number: found[0]
+            for number, station in self._stations.items()
+            if prisms[station.prism] == 1 and (found := _position_and_velocity(tracks[station.prism], now_ns))
         }
-        others = [other for other in points if other != number]
-        station = self._stations[number]
-        if (
-            number not in points
-            or len(others) < MIN_WITNESSES
-            or not all(self._fit(points, one, other) for one, other in combinations(others, 2))
-        ):
-            station.astray_ns = None
-        elif any(self._fit(points, number, other) for other in others):
-            station.has_agreed, station.astray_ns = True, None
-        elif station.has_agreed and station.astray_ns is None:
-            station.astray_ns = now_ns
-
-    def _predicted(
-        self, station: _Station, now_ns: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Return where a station sees its prism now, and its velocity."""
-        tracks = build_tracks(self._parameters, self._recent_of(station, now_ns))
-        return _position_and_velocity(tracks[station.prism], now_ns)
+        fitting = {pair for pair in combinations(points, 2) if self._fit(points, *pair)}
+        for number, station in self._stations.items():
+            others = [other for other in points if other != number]
+            agree = len(others) >= MIN_WITNESSES and fitting.issuperset(combinations(others, 2))
+            if number not in points or not agree:
+                station.astray_ns = None
+            elif any(number in pair for pair in fitting):
+                station.has_agreed, station.astray_ns = True, None
+            elif station.has_agreed and station.astray_ns is None:
+                station.astray_ns = now_ns
 
     def _fit(self, points: Mapping[int, NDArray[np.float64]], one: int, other: int) -> bool:
         """Whether the points of two stations are as far apart as their prisms."""

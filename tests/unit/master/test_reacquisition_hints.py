@@ -330,14 +330,14 @@ def test_station_that_never_fitted_or_nearly_fits_gets_no_hint(agreed_until_s: f
 
 
 def test_own_prism_after_another_robots_ends_the_hints() -> None:
-    """One measurement that fits is enough."""
+    """After two measurements that fit: its velocity is known again."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
     watch(hints, scene, until_s=LOST_S)
     _follow_another_robot(hints, scene, since_s=LOST_S, until_s=12.5, away_m=4.0)
     assert hints.direction(2, ns(12.5)) is not None
-    watch(hints, scene, since_s=12.8, until_s=13.3, sees=lambda _station, _time_s: Status.OK)
-    assert hints.direction(2, ns(13.3)) is None
+    watch(hints, scene, since_s=12.8, until_s=14.1, sees=lambda _station, _time_s: Status.OK)
+    assert hints.direction(2, ns(14.1)) is None
 
 
 def test_driving_robot_is_no_other_robot() -> None:

@@ -154,7 +154,7 @@ class ReacquisitionHints:
 
     def _judge_targets(self, now_ns: int) -> None:
         """Take which stations' points fit those of the others, if two or more of these fit each other."""
-        if 0 <= now_ns - self._judged_ns < JUDGEMENT_INTERVAL_NS:
+        if self._parameters.no_poses is not None or 0 <= now_ns - self._judged_ns < JUDGEMENT_INTERVAL_NS:
             return
         self._judged_ns = now_ns
         recent = [point for station in self._stations.values() for point in self._recent_of(station, now_ns)]

@@ -340,6 +340,14 @@ def test_own_prism_after_another_robots_ends_the_hints() -> None:
     assert hints.direction(2, ns(14.1)) is None
 
 
+def test_without_set_up_nothing_is_judged() -> None:
+    """There is no layout, and the measurements are recorded nevertheless."""
+    scene = stationary_scene()
+    hints = ReacquisitionHints(replace(scene.parameters, prisms=(), no_poses="no layout"))
+    watch(hints, scene)
+    assert hints.direction(2, ns(12.5)) is None
+
+
 def test_driving_robot_is_no_other_robot() -> None:
     """Stations measure at different times, and the robot turns."""
     scene = stationary_scene().moving(driving)

@@ -77,7 +77,8 @@ def test_station_that_follows_another_robot_is_called_back(tmp_path: Path) -> No
 
         def track(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
             away_m = np.clip(1.5 * (times_s - AT_S), 0.0, 12.0)
-            return begin + away_m[:, None] * np.array([-0.6, 0.8, 0.0])
+            points: NDArray[np.float64] = begin + away_m[:, None] * np.array([-0.6, 0.8, 0.0])
+            return points
 
         assert instrument.take_over(instrument.add_prism(track, AT_S, 99.0, 1))
         await mission.sleep_until(AT_S + 5.0)

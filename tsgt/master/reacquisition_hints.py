@@ -5,7 +5,7 @@ that other stations measured within the last second give a direction, and the la
 robot's speed adds to the spread. Nothing is assumed about the robot's orientation.
 
 A station that follows a prism of another robot, or a mirror image, measures on: its points are farther from those of the
-others than the layout allows. It gets a direction, too, if the others agree and it has agreed with them before.
+others than the layout allows. It gets a direction, too, if the others are consistent with each other, and it was consistent with them before.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ START_ALLOWANCE_M = 0.5  # a stationary robot may start: 1 m/s^2 within a second
 
 MAX_SPREAD_RAD = math.radians(45.0)  # a direction with a larger spread is useless: the robot is too near
 
-MAX_MISMATCH_M = 0.5
+MAX_DISTANCE_ERROR_M = 0.5
 """By more than this the distance of two points from each other differs from the layout's only if one is of another target: the
 points are predicted by up to a second, and the robot may turn."""
 
-MIN_WITNESSES = 2
+MIN_CONSISTENT_POINTS = 2
 """Two points alone that do not fit do not tell whose is wrong."""
 
-JUDGEMENT_INTERVAL_NS = 400_000_000  # about a frame
+COMPARISON_INTERVAL_NS = 400_000_000  # about a frame
 
 MAX_TARGET_HINTS = 2
 """Directions for a station that measures another target. More are useless if that is in the same direction, and harmful if
@@ -81,8 +81,8 @@ class _Station:
     prism: int
     newest_ns: int = 0
     lost_ns: int | None = None  # when its instrument lost the prism; None while it has it
-    astray_ns: int | None = None  # since when its points are not of its prism; None: they may be
-    has_agreed: bool = False  # whether its points have fitted those of others
+    wrong_target_since_ns: int | None = None  # since when its points are not of its prism; None: they may be
+    was_consistent: bool = False  # whether its points have been consistent with those of others
     second_face: bool = False
     points: deque[PolarMeasurement] = field(default_factory=lambda: deque(maxlen=POINT_HISTORY_CAPACITY))
     hint: Direction | None = None
@@ -95,7 +95,7 @@ class ReacquisitionHints:
 
     def __init__(self, parameters: Parameters) -> None:
         self._stations = {station.station: _Station(station.prism) for station in parameters.stations}
-        self._judged_ns = 0
+        self._compared_ns = 0
         self.set_up(parameters)
 
     def set_up(self, parameters: Parameters) -> None:
@@ -104,7 +104,7 @@ class ReacquisitionHints:
         self._frames = {station.station: station for station in parameters.stations}
         self._layout = {prism.prism: np.array(prism.position_m) for prism in parameters.prisms}
         for station in self._stations.values():
-            station.has_agreed = False
+            station.was_consistent = False
 
     def measured(self, measurement: PolarMeasurement) -> None:
         """Take a measurement; those of a station arrive in any order."""
@@ -123,8 +123,8 @@ class ReacquisitionHints:
                 station.lost_ns = at_ns
             if usable:
                 station.second_face = measurement.zenith_angle_rad > math.pi
-                self._judge_targets(at_ns)
-                if station.astray_ns is None:
+                self._compare_targets(at_ns)
+                if station.wrong_target_since_ns is None:
                     station.hint, station.hint_ns, station.hints = None, None, 0
         elif usable and station.lost_ns is not None:  # a late one: the prism was found and lost again
             station.lost_ns = max(station.lost_ns, at_ns)
@@ -132,7 +132,9 @@ class ReacquisitionHints:
     def direction(self, number: int, now_ns: int) -> Direction | None:
         """Return where to search, the same object for 5 s (another is a new command); None: no hint. Master's Unix clock."""
         station = self._stations[number]
-        since_ns = min((ns for ns in (station.lost_ns, station.astray_ns) if ns is not None), default=now_ns)
+        since_ns = min(
+            (ns for ns in (station.lost_ns, station.wrong_target_since_ns) if ns is not None), default=now_ns
+        )
         if now_ns - since_ns <= HINT_DELAY_NS:
             return None
         if self._parameters.no_poses is not None:
@@ -142,7 +144,7 @@ class ReacquisitionHints:
             if since_ns < HINT_INTERVAL_NS:
                 return station.hint
             if station.lost_ns is None and station.hints >= MAX_TARGET_HINTS:
-                station.astray_ns, station.has_agreed = None, False
+                station.wrong_target_since_ns, station.was_consistent = None, False
                 return None
             if since_ns < SLOW_HINT_INTERVAL_NS and station.hints >= MAX_FREQUENT_HINTS:
                 return None
@@ -152,11 +154,11 @@ class ReacquisitionHints:
             station.hints += 1
         return station.hint
 
-    def _judge_targets(self, now_ns: int) -> None:
+    def _compare_targets(self, now_ns: int) -> None:
         """Take which stations' points fit those of the others, if two or more of these fit each other."""
-        if self._parameters.no_poses is not None or 0 <= now_ns - self._judged_ns < JUDGEMENT_INTERVAL_NS:
+        if self._parameters.no_poses is not None or 0 <= now_ns - self._compared_ns < COMPARISON_INTERVAL_NS:
             return
-        self._judged_ns = now_ns
+        self._compared_ns = now_ns
         recent = [point for station in self._stations.values() for point in self._recent_of(station, now_ns)]
         tracks = build_tracks(self._parameters, recent)
         prisms = Counter(station.prism for station in self._stations.values())
@@ -168,22 +170,22 @@ class ReacquisitionHints:
         fitting = {pair for pair in combinations(points, 2) if self._fit(points, *pair)}
         for number, station in self._stations.items():
             others = [other for other in points if other != number]
-            agree = len(others) >= MIN_WITNESSES and fitting.issuperset(combinations(others, 2))
+            agree = len(others) >= MIN_CONSISTENT_POINTS and fitting.issuperset(combinations(others, 2))
             if number not in points or not agree:
-                station.astray_ns = None
+                station.wrong_target_since_ns = None
             elif any(number in pair for pair in fitting):
-                station.has_agreed, station.astray_ns = True, None
-            elif station.has_agreed and station.astray_ns is None:
-                station.astray_ns = now_ns
+                station.was_consistent, station.wrong_target_since_ns = True, None
+            elif station.was_consistent and station.wrong_target_since_ns is None:
+                station.wrong_target_since_ns = now_ns
 
     def _fit(self, points: Mapping[int, NDArray[np.float64]], one: int, other: int) -> bool:
         """Whether the points of two stations are as far apart as their prisms."""
         layout_m = self._layout[self._stations[one].prism] - self._layout[self._stations[other].prism]
         apart_m = np.linalg.norm(points[one] - points[other]) - np.linalg.norm(layout_m)
-        return bool(abs(apart_m) <= MAX_MISMATCH_M)
+        return bool(abs(apart_m) <= MAX_DISTANCE_ERROR_M)
 
     def _compute(self, number: int, station: _Station, now_ns: int) -> Direction | None:
-        seeing = (other for other in self._stations.values() if other.astray_ns is None)
+        seeing = (other for other in self._stations.values() if other.wrong_target_since_ns is None)
         recent = [point for other in seeing for point in self._recent_of(other, now_ns)]
         tracks = build_tracks(self._parameters, recent)
         known = {

@@ -319,13 +319,15 @@ def test_station_on_another_robots_prism_gets_a_hint() -> None:
     assert hints.direction(2, ns(80.0)) is None
 
 
-@pytest.mark.parametrize(("agreed_until_s", "away_m"), [(LOST_S, 0.3), (0.0, 4.0)])
-def test_station_that_never_fitted_or_nearly_fits_gets_no_hint(agreed_until_s: float, away_m: float) -> None:
+@pytest.mark.parametrize(("consistent_until_s", "away_m"), [(LOST_S, 0.3), (0.0, 4.0)])
+def test_station_that_was_never_consistent_or_nearly_is_gets_no_hint(
+    consistent_until_s: float, away_m: float
+) -> None:
     """A wrong frame is no reason to release a prism, and neither is what a turning robot leaves uncertain."""
     scene = stationary_scene()
     hints = ReacquisitionHints(scene.parameters)
-    watch(hints, scene, until_s=agreed_until_s)
-    _follow_another_robot(hints, scene, since_s=agreed_until_s, until_s=20.0, away_m=away_m)
+    watch(hints, scene, until_s=consistent_until_s)
+    _follow_another_robot(hints, scene, since_s=consistent_until_s, until_s=20.0, away_m=away_m)
     assert hints.direction(2, ns(20.0)) is None
 
 
@@ -340,7 +342,7 @@ def test_own_prism_after_another_robots_ends_the_hints() -> None:
     assert hints.direction(2, ns(14.1)) is None
 
 
-def test_without_set_up_nothing_is_judged() -> None:
+def test_without_set_up_targets_are_not_compared() -> None:
     """There is no layout, and the measurements are recorded nevertheless."""
     scene = stationary_scene()
     hints = ReacquisitionHints(replace(scene.parameters, prisms=(), no_poses="no layout"))

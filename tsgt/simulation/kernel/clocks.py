@@ -8,9 +8,12 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from tsgt.clock import Clock
+from tsgt.simulation.kernel.event_loop import VirtualEventLoop
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+
+    from tsgt.simulation.kernel.timeline import Timeline
 
 
 class SimulatedClock(Clock, Protocol):
@@ -26,10 +29,12 @@ class SimulatedClock(Clock, Protocol):
 
 
 class VirtualClock:
-    """The time of the running event loop, used as true time."""
+    """The time of the running event loop, used as true time; ``timeline``: that of this loop, if it is known already."""
 
-    def __init__(self, unix_at_zero_ns: int) -> None:
+    def __init__(self, unix_at_zero_ns: int, timeline: Timeline | None = None) -> None:
         self._unix_at_zero_ns = unix_at_zero_ns
+        if timeline is not None:
+            self.monotonic_ns = timeline.now_ns  # type: ignore[method-assign]  # it is read in every other callback
 
     def monotonic_ns(self) -> int:
         """Return the loop's time in ns."""
@@ -41,7 +46,11 @@ class VirtualClock:
 
     async def sleep_until(self, monotonic_ns: int) -> None:
         """Sleep until an instant; yields to other tasks at least once."""
-        await asyncio.sleep(max(0, monotonic_ns - self.monotonic_ns()) / 1e9)
+        loop, duration_ns = asyncio.get_running_loop(), monotonic_ns - self.monotonic_ns()
+        if duration_ns > 0 and isinstance(loop, VirtualEventLoop):
+            await loop.sleep_until_ns(monotonic_ns)
+        else:
+            await asyncio.sleep(max(0, duration_ns) / 1e9)
 
     def step(self, by_ns: int) -> None:
         """Step the Unix clock; positive: forward. CLOCK_MONOTONIC is unaffected."""

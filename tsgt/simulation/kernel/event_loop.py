@@ -11,6 +11,9 @@ unpredictable virtual time while events are scheduled.
 Polling sockets costs as much as one or two callbacks. An isolated loop, without threads or other processes, polls in
 every round only while its tasks have connections; listening sockets and the loop's wake-up socket are polled every
 ``_IDLE_POLL_INTERVAL`` rounds.
+
+A mission makes thousands of callbacks per second of CPU, so the loop replaces what asyncio does for each one: it has no
+debug mode, and no queue of timers besides the timeline.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple, Unpack
 from tsgt.simulation.kernel.timeline import VirtualTimeline
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sized
+    from collections import deque
+    from collections.abc import Awaitable, Callable, Sequence, Sized
     from concurrent.futures import Executor
     from contextvars import Context
 
@@ -54,19 +58,48 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
         sockets are polled rarely. Executor work that waits for something in the loop would deadlock.
     """
 
+    if TYPE_CHECKING:  # BaseEventLoop's own, unknown to typeshed
+        _ready: deque[asyncio.Handle]
+        _stopping: bool
+
+        def _process_events(self, event_list: list[tuple[selectors.SelectorKey, int]]) -> None: ...
+        def _check_closed(self) -> None: ...
+
     def __init__(self, timeline: VirtualTimeline, *, isolated: bool = False) -> None:
         self._timeline = timeline
         self._isolated = isolated
         self._running_in_executor = 0
         self._running_inline = False
         self._suspended: list[_Suspension] = []
-        selector = _TimeJumpSelector(timeline, time_frozen=lambda: self._running_in_executor > 0)
+        self._jumping = selector = _TimeJumpSelector(
+            timeline, time_frozen=lambda: self._running_in_executor > 0
+        )
         super().__init__(selector)
-        selector.attach(self._ready, isolated=isolated)  # type: ignore[attr-defined]  # BaseEventLoop's, unknown to typeshed
+        selector.attach(self._ready, isolated=isolated)
 
     def time(self) -> float:
         """Seconds since the timeline's zero; exact to the nanosecond for the first 26 days."""
         return self._timeline.now_ns() / 1e9
+
+    def _run_once(self) -> None:
+        """Make the callbacks that are ready, after a look at sockets and timeline."""
+        ready = self._ready
+        events = self._jumping.select(0 if ready or self._stopping else None)
+        if events:
+            self._process_events(events)
+        for _ in range(len(ready)):
+            handle = ready.popleft()
+            if not handle._cancelled:  # noqa: SLF001 (as in asyncio's own loop)
+                handle._run()  # noqa: SLF001
+
+    def call_soon(
+        self, callback: Callable[[Unpack[Ts]], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
+        """Call back in the next round."""
+        self._check_closed()
+        handle = _Callback(callback, args, self, copy_context() if context is None else context)
+        self._ready.append(handle)
+        return handle
 
     def call_at(
         self,
@@ -76,13 +109,30 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
         context: Context | None = None,
     ) -> asyncio.TimerHandle:
         """Schedule on the timeline, which orders all events, instead of the loop's own queue."""
-        timer = _Timer(when, callback, args, self, context)
+        timer = _Timer(when, callback, args, self, copy_context() if context is None else context)
         timer.event = self._timeline.call_at(round(when * 1e9), partial(self._due, timer))
         return timer
 
-    def _due(self, timer: asyncio.TimerHandle) -> None:
-        if not self.is_closed():
-            self._add_callback(timer)
+    def _due(self, timer: asyncio.Handle) -> None:
+        if self._suspended:
+            self._add_or_hold(timer)
+        else:
+            self._ready.append(timer)
+
+    async def sleep_until_ns(self, at_ns: int) -> None:
+        """Sleep until a time of the timeline in ns; yields to other tasks at least once."""
+        wakened = self.create_future()
+        event = self._timeline.call_at(at_ns, partial(self._wake, wakened, copy_context()))
+        try:
+            await wakened
+        finally:
+            event.cancel()
+
+    def _wake(self, sleeper: asyncio.Future[None], context: Context) -> None:
+        if self._suspended:
+            self._add_or_hold(_Callback(_set_if_pending, (sleeper, sleeper.set_result, None), self, context))
+        else:
+            _set_if_pending(sleeper, sleeper.set_result, None)
 
     def run_in_executor(
         self, executor: Executor | None, func: Callable[[Unpack[Ts]], T], *args: *Ts
@@ -150,20 +200,16 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
     def _call_soon_or_hold(
         self, callback: Callable[..., object], *args: Any, context: Context | None = None
     ) -> asyncio.Handle:
-        context = copy_context() if context is None else context
-        for suspension in self._suspended:
-            if suspension.belongs(context):
-                handle = asyncio.Handle(callback, args, self, context)
-                suspension.held.append(handle)
-                return handle
-        return super().call_soon(callback, *args, context=context)
+        handle = _Callback(callback, args, self, copy_context() if context is None else context)
+        self._add_or_hold(handle)
+        return handle
 
     def _add_or_hold(self, handle: asyncio.Handle) -> None:
         for suspension in self._suspended:
             if suspension.belongs(handle._context):  # type: ignore[attr-defined]  # noqa: SLF001 (asyncio's own)
                 suspension.held.append(handle)
                 return
-        super()._add_callback(handle)  # type: ignore[misc]  # as in _due
+        self._ready.append(handle)
 
     def _executor_done(self, _: asyncio.Future[Any]) -> None:
         self._running_in_executor -= 1
@@ -191,16 +237,57 @@ class _Suspension:
         self.held: list[asyncio.Handle] = []
 
 
+def _ignore() -> None:
+    """Do nothing."""
+
+
 def _set_if_pending(future: asyncio.Future[Any], set_outcome: Callable[[Any], None], outcome: object) -> None:
     if not future.done():  # cancelled meanwhile
         set_outcome(outcome)
 
 
-class _Timer(asyncio.TimerHandle):
+class _Callback(asyncio.Handle):
+    """A handle that does not ask its loop whether it is in debug mode."""
+
+    __slots__ = ()
+
+    def __init__(
+        self,
+        callback: Callable[..., object],
+        args: Sequence[Any],
+        loop: asyncio.AbstractEventLoop,
+        context: Context,
+    ) -> None:
+        self._callback = callback
+        self._args = args
+        self._loop = loop
+        self._context = context
+        self._cancelled = False
+        self._repr = self._source_traceback = None
+
+    def cancel(self) -> None:
+        """Do not call back."""
+        self._cancelled = True
+        self._callback, self._args = _ignore, ()
+
+
+class _Timer(_Callback, asyncio.TimerHandle):
     """A timer of the loop on the timeline."""
 
     __slots__ = ("event",)
     event: Handle
+
+    def __init__(
+        self,
+        when: float,
+        callback: Callable[..., object],
+        args: Sequence[Any],
+        loop: asyncio.AbstractEventLoop,
+        context: Context,
+    ) -> None:
+        super().__init__(callback, args, loop, context)
+        self._when = when
+        self._scheduled = False  # in no queue of asyncio's
 
     def cancel(self) -> None:
         """Cancel the timeline's event as well."""
@@ -256,15 +343,15 @@ class _TimeJumpSelector(selectors.DefaultSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Poll the sockets; when the loop is idle (no timeout: it has no timers of its own), advance time."""
+        timeline = self._timeline
         ready = self._poll()
         if timeout == 0:
-            self._timeline.advance(0)
-        while not (timeout == 0 or ready or self._ready):
-            next_ns = self._timeline.next_ns()
-            if next_ns is None or self._time_frozen():
+            timeline.call_due()
+            return ready
+        while not (ready or self._ready):
+            if self._time_frozen() or not timeline.call_next():
                 return super().select()
             # Events of the hardware that make no callback ready need no round of the loop.
-            self._timeline.advance_to(next_ns)
             if not self._ready:
                 ready = self._poll()
         return ready

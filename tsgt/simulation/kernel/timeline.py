@@ -54,7 +54,9 @@ class VirtualTimeline:
         """
         event = _Event(callback, self)
         self._scheduled += 1
-        heapq.heappush(self._heap, (max(at_ns, self._now_ns), self._scheduled, event))
+        if at_ns < self._now_ns:
+            at_ns = self._now_ns
+        heapq.heappush(self._heap, (at_ns, self._scheduled, event))
         return event
 
     def next_ns(self) -> int | None:
@@ -64,6 +66,18 @@ class VirtualTimeline:
             heapq.heappop(heap)
             self._cancelled -= 1
         return heap[0][0] if heap else None
+
+    def call_due(self) -> None:
+        """Make the callbacks that are due now."""
+        if self._heap and self._heap[0][0] <= self._now_ns:
+            self.advance_to(self._now_ns)
+
+    def call_next(self) -> bool:
+        """Advance to the next event and make all callbacks of its instant; return whether there was one."""
+        next_ns = self.next_ns()
+        if next_ns is not None:
+            self.advance_to(next_ns)
+        return next_ns is not None
 
     def advance(self, duration_ns: int) -> None:
         """Advance by a duration."""

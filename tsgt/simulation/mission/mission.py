@@ -119,8 +119,8 @@ class Mission:
         self._scenario = scenario
         self._options = options
         self._folder = folder
-        self._true = VirtualClock(START_UNIX_NS)
-        self.clock = VirtualClock(START_UNIX_NS)  # the master's clock
+        self._true = VirtualClock(START_UNIX_NS, timeline)
+        self.clock = VirtualClock(START_UNIX_NS, timeline)  # the master's clock
         self._settings = lora_settings(
             radio_config(scenario, MASTER, folder), Path(f"scenario {scenario.name}")
         )
@@ -272,7 +272,7 @@ class Mission:
     async def run_second_master(self, for_s: float) -> None:
         """Run another master with the same key, stations and set-up beside the robot's, and then stop it."""
         name = f"other master{len(self.other_master_logs)}"
-        clock = VirtualClock(START_UNIX_NS)
+        clock = VirtualClock(START_UNIX_NS, self._timeline)
         computer = Computer(name, clock, self.air, self._settings, self._interferer_rng.spawn(1)[0], None)
         self._positions_m[name] = _INTERFERER_POSITION_M
         master_log = self._new_master_log(name.replace(" ", "-"), clock)

@@ -3,8 +3,8 @@
 The scenario ``dynamic`` with each protocol and each estimator: the real daemons, chips at register level, instruments
 that speak GeoCOM, and afterwards every checker. CPU time is that of the whole process, the least of the runs; on a
 machine that is busy with other things it grows, so compare figures of one sitting only. The replay reads the recording,
-computes all poses again as the master did, and compares each line; the soak test checks it in a quarter of the missions with
-`continuous`. Its CPU time is that of live estimation. The five seconds of the drain
+computes all poses again as the master did, and compares each line; the soak test checks it in a quarter of the missions.
+Its CPU time is that of live estimation. The five seconds of the drain
 at the end of a run are simulated and not counted.
 
 Run ``python benchmarks/run.py simulation_speed [SECONDS] [RUNS]``.

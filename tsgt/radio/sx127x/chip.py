@@ -58,6 +58,9 @@ class Chip:
         self._settings = settings
         self._registers = RegisterAccess(hal)
         self._probe = 0x55
+        # What the supervision of a reception reads many times.
+        self._receiving = self._op_mode(Mode.RXCONTINUOUS)
+        self._sync_word = RegisterValue(Register.SYNC_WORD, settings.sync_word)
 
     async def set_up(self) -> None:
         """Reset the chip, identify it, write and verify all settings, and enter reception.
@@ -103,8 +106,8 @@ class Chip:
         A receiver that fails with all its registers intact is indistinguishable from a quiet channel. Raises RadioError
         if the chip was reset, hangs, or is disconnected.
         """
-        self._registers.verify(self._op_mode(Mode.RXCONTINUOUS))
-        self._registers.verify(RegisterValue(Register.SYNC_WORD, self._settings.sync_word))
+        self._registers.verify(self._receiving)
+        self._registers.verify(self._sync_word)
         # This pointer is unused between packets; a hung chip keeps its registers and only fails a write.
         self._probe ^= 0xFF
         self._registers.write_verified(RegisterValue(Register.FIFO_ADDR_PTR, self._probe))

@@ -151,7 +151,7 @@ class RegisterAccess:
 
     def read(self, address: int) -> int:
         """Read one register."""
-        return self.read_burst(address, 1)[0]
+        return self._hal.transfer(bytes((address, 0)))[1]
 
     def read_burst(self, address: int, count: int) -> bytes:
         """Read consecutive registers, or bytes of the FIFO, whose address does not increment."""
@@ -159,7 +159,7 @@ class RegisterAccess:
 
     def write(self, address: int, *values: int) -> None:
         """Write consecutive registers."""
-        self.write_burst(address, bytes(values))
+        self._hal.transfer(bytes((reg.WRITE | address, *values)))
 
     def write_burst(self, address: int, data: bytes) -> None:
         """Write consecutive registers, or bytes of the FIFO."""

@@ -152,10 +152,10 @@ class SX1276Chip:
 
     def transfer(self, data: bytes) -> bytes:
         """Exchange bytes in one NSS window."""
+        if not self._booting and self._is_plain_access(data):
+            return self._transfer_plain(data)
         self.select()
-        response = (
-            self._transfer_plain(data) if self._is_plain_access(data) else bytes(map(self.exchange, data))
-        )
+        response = bytes(map(self.exchange, data))
         self.deselect()
         return response
 
@@ -266,11 +266,12 @@ class SX1276Chip:
                 self._write(register, byte)
             return bytes(before)
         end = address + count
+        if address > Register.RSSI_WIDEBAND or end <= Register.RSSI_VALUE:
+            return b"\0" + self._memory.lora[address:end]
         response = bytearray(1) + self._memory.lora[address:end]
-        if address <= Register.RSSI_WIDEBAND and end > Register.RSSI_VALUE:
-            for register, measured in self._measured.items():
-                if address <= register < end:
-                    response[1 + register - address] = measured()
+        for register, measured in self._measured.items():
+            if address <= register < end:
+                response[1 + register - address] = measured()
         return bytes(response)
 
     def _exchange_fifo(self, byte: int) -> int:

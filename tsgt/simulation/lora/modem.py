@@ -308,7 +308,7 @@ class Modem:
         lora[Register.MODEM_STAT] = lora[Register.MODEM_STAT] & 0xE0 | status
 
     def _schedule_with_jitter(self, at_ns: int, action: Callable[[int], None]) -> None:
-        self._schedule(at_ns + round(self._rng.normal(0.0, self._timing.jitter_sigma_ns)), action)
+        self._schedule(at_ns + round(self._timing.jitter_sigma_ns * self._rng.standard_normal()), action)
 
     def _schedule(self, at_ns: int, action: Callable[[int], None]) -> None:
         """Schedule the modem's next action; it gets its nominal time, however late it is called."""

@@ -232,9 +232,9 @@ def _put_residual(writer: BitWriter, residual: int, widths: tuple[int, ...]) -> 
     """Append a number modulo the last width: index of the width, then the number in two's complement."""
     residual = _signed(residual, widths[-1])
     for index, width in enumerate(widths):
-        if _signed(residual, width) == residual:
-            writer.put(index, _WIDTH_INDEX_BITS)
-            writer.put(residual % (1 << width), width)
+        half = 1 << width - 1
+        if -half <= residual < half:
+            writer.put(index << width | residual & (1 << width) - 1, _WIDTH_INDEX_BITS + width)
             return
 
 

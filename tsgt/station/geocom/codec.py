@@ -314,7 +314,7 @@ def _decode_values(text: str) -> tuple[int | float | str, ...]:
 
 def _decode_value(text: str) -> int | float:
     text = text.strip()
-    if _INTEGER.fullmatch(text):
+    if "." not in text and _INTEGER.fullmatch(text):
         return int(text)
     if _REAL.fullmatch(text):
         number = float(text)

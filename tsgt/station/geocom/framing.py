@@ -36,7 +36,17 @@ class ReplyLines:
 
     def push(self, chunk: Chunk) -> list[StampedLine]:
         """Add data; return the replies completed by it."""
-        self._buffer += chunk.data
+        data = chunk.data
+        end = data.find(b"\r")
+        if (
+            not self._buffer
+            and end + 2 == len(data)
+            and data.find(b"\n") == end + 1
+            and not data.rfind(_REPLY_MARK)
+        ):
+            # Nearly always: one whole reply.
+            return [StampedLine(data[:end], chunk.at_ns - round(len(data) * self._byte_ns))]
+        self._buffer += data
         self._arrivals.append((len(self._buffer), chunk.at_ns))
         *ended, rest = self._buffer.replace(b"\n", b"\r").split(b"\r")
         lines = []

@@ -69,7 +69,8 @@ class GeoComServer:
         self._station = station
         self._timeline = timeline
         self._rng = generator
-        self._processing_ms = model.processing_min_ms, model.processing_max_ms
+        self._processing_ms = model.processing_min_ms
+        self._processing_range_ms = model.processing_max_ms - model.processing_min_ms
         self.processing_factor = 1.0  # by which processing takes longer than usual
         self._stalls_per_min = model.stalls_per_min
         self._next_stall_ns = self._draw_stall()
@@ -182,7 +183,8 @@ class GeoComServer:
         """Send a response after the processing time."""
         self._job = None
         now_ns = self._timeline.now_ns()
-        processing_ms = self._rng.uniform(*self._processing_ms) * self.processing_factor
+        processing_ms = self._processing_ms + self._processing_range_ms * self._rng.random()
+        processing_ms *= self.processing_factor
         if now_ns >= self._next_stall_ns:
             processing_ms = self._rng.uniform(*STALL_S) * 1e3
             self._next_stall_ns = self._draw_stall()

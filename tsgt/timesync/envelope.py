@@ -90,7 +90,7 @@ def fit_lower_envelope(
     for _ in range(_MAX_REFINEMENTS):
         step = (high - low) / (_GRID_SLOPES - 1)
         slopes = [low + i * step for i in range(_GRID_SLOPES)]
-        heights = [min(y - slope * x for x, y in corners) for slope in slopes]
+        heights = [min([y - slope * x for x, y in corners]) for slope in slopes]
         log_weights = [
             (height + slope * centre) / scale - 0.5 * ((slope - prior_slope) / prior_sigma) ** 2
             for slope, height in zip(slopes, heights, strict=True)
@@ -98,8 +98,8 @@ def fit_lower_envelope(
         largest = max(log_weights)
         weights = [math.exp(log_weight - largest) for log_weight in log_weights]
         total = sum(weights)
-        slope = sum(w * b for w, b in zip(weights, slopes, strict=True)) / total
-        slope_variance = sum(w * (b - slope) ** 2 for w, b in zip(weights, slopes, strict=True)) / total
+        slope = sum([w * b for w, b in zip(weights, slopes, strict=True)]) / total
+        slope_variance = sum([w * (b - slope) ** 2 for w, b in zip(weights, slopes, strict=True)]) / total
         sigma = math.sqrt(slope_variance)
         if sigma > _STEPS_PER_SIGMA * step:
             break

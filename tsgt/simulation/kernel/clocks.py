@@ -162,8 +162,16 @@ class DriftingClock:
         elapsed_ns = local_ns - segment.local_ns
         if segment.ppm == _SUSPENDED_PPM:
             return segment.true_ns + elapsed_ns * 1_000_000
-        gained_ns = elapsed_ns * segment.ppm * 1e-6 / (1 + segment.ppm * 1e-6)
-        true_ns = segment.true_ns + elapsed_ns - round(gained_ns)
+        ppm = segment.ppm
+        since_ns = elapsed_ns - round(elapsed_ns * ppm * 1e-6 / (1 + ppm * 1e-6))
+        if segment is self._segments[-1]:  # nearly always: the same search, without one for the segment
+            while since_ns > 0 and since_ns + round(since_ns * ppm * 1e-6) >= elapsed_ns:
+                since_ns -= 1
+            while since_ns + round(since_ns * ppm * 1e-6) < elapsed_ns:
+                since_ns += 1
+            if since_ns > 0:
+                return segment.true_ns + since_ns
+        true_ns = segment.true_ns + since_ns
         while self.local_ns(true_ns) >= local_ns:
             true_ns -= 1
         while self.local_ns(true_ns) < local_ns:

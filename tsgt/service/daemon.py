@@ -107,11 +107,16 @@ async def sync_periodically(
             failing = False
 
 
-def sd_notify(*assignments: str) -> None:
-    """Notify systemd with assignments as in sd_notify(3), such as ``READY=1``; without effect outside of systemd."""
+def sd_notify(*assignments: str, status: Callable[[], str] | None = None) -> None:
+    """Notify systemd with assignments as in sd_notify(3), such as ``READY=1``; without effect outside of systemd.
+
+    ``status``: returns the text of a further assignment, ``STATUS``.
+    """
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
+    if status is not None:
+        assignments = (*assignments, f"STATUS={status()}")
     if address.startswith("@"):  # an abstract socket
         address = "\0" + address[1:]
     try:
@@ -134,11 +139,11 @@ def watchdog_interval_s() -> float | None:
 async def notify_systemd(status: Callable[[], str], clock: Clock) -> NoReturn:
     """Notify systemd of readiness, then each second of the status line and of being alive, and at the end of stopping."""
     interval_s = min(STATUS_INTERVAL_S, watchdog_interval_s() or STATUS_INTERVAL_S)
-    sd_notify("READY=1", f"STATUS={status()}")
+    sd_notify("READY=1", status=status)
     try:
         while True:
             await clock.sleep_until(clock.monotonic_ns() + round(interval_s * 1e9))
-            sd_notify("WATCHDOG=1", f"STATUS={status()}")
+            sd_notify("WATCHDOG=1", status=status)
     finally:
         sd_notify("STOPPING=1")
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
 from collections import Counter
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +28,7 @@ from tsgt.simulation.kernel import VirtualTimeline, run_virtual
 from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult, Slew, has_odometry, listen_to_stream
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Iterator
     from pathlib import Path
 
     from tsgt.config import ScenarioConfig
@@ -35,6 +37,9 @@ if TYPE_CHECKING:
 
 MEMORY_CHECK_S = 60
 """Interval of the memory checks."""
+
+GARBAGE_THRESHOLD = 10_000
+"""New objects, less those that are gone, after which the garbage collector looks for cycles."""
 
 
 def simulate(
@@ -132,4 +137,19 @@ def simulate(
             odometry=mission.odometry,
         )
 
-    return run_virtual(run, timeline, isolated=True)
+    with _rare_garbage_collection():
+        return run_virtual(run, timeline, isolated=True)
+
+
+@contextmanager
+def _rare_garbage_collection() -> Iterator[None]:
+    """Let the garbage collector, and the memory checks, look only at what a mission creates, and less often."""
+    thresholds = gc.get_threshold()
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(GARBAGE_THRESHOLD, *thresholds[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()

@@ -160,6 +160,9 @@ class MasterLog:
         if isinstance(record, ImuSamples | OdometrySamples):
             return  # recorded, not on the stream
         self.line_hashes.append(hash(line))
+        if isinstance(record, PoseRecord):  # most records are poses
+            self._observe_epoch(record)
+            return
         if isinstance(record, PolarMeasurement):
             self.measurements.append(record)
             self.arrived_ns.append(self._now_ns())
@@ -174,17 +177,6 @@ class MasterLog:
             self.setup_hashes.add(hash(line))
         elif isinstance(record, EventRecord):
             self.events.append(record)
-        elif isinstance(record, PoseRecord):
-            self.pose_counts[record.series] += 1
-            self.epochs_ns.setdefault(record.series, array("q")).append(record.stamp_ns)
-            self._count(record)
-            if record.kind == "predicted":
-                self._predicted_imu = record.imu
-                if record.jump_m is not None:
-                    self.jumps_m.append(record.jump_m)
-            self.predicted_with_imu += record.kind == "predicted" and record.imu == "used"
-            if record.valid:
-                self._observe_pose(record)
         elif isinstance(record, BeaconRecord):
             first = self._first_beacon = self._first_beacon or record
             self.beacons_ns[record.session, record.counter] = record.stamp_ns
@@ -193,17 +185,24 @@ class MasterLog:
                 record.counter - first.counter,
                 record.stamp_ns - first.stamp_ns,
             )
+        self._counts = self._counts._replace(measurements=len(self.measurements))
+        self._counts_before_poses = self._counts
 
-        if not isinstance(record, PoseRecord):
-            self._counts = self._counts._replace(measurements=len(self.measurements))
-            self._counts_before_poses = self._counts
-
-    def _count(self, pose: PoseRecord) -> None:
+    def _observe_epoch(self, pose: PoseRecord) -> None:
+        self.pose_counts[pose.series] += 1
+        self.epochs_ns.setdefault(pose.series, array("q")).append(pose.stamp_ns)
         if pose.kind != "smoothed":
             counts = self._counts
-            self._counts = counts._replace(
-                poses=counts.poses + 1, valid_poses=counts.valid_poses + pose.valid
+            self._counts = PublishedCounts(
+                counts.measurements, counts.poses + 1, counts.valid_poses + pose.valid
             )
+        if pose.kind == "predicted":
+            self._predicted_imu = pose.imu
+            if pose.jump_m is not None:
+                self.jumps_m.append(pose.jump_m)
+            self.predicted_with_imu += pose.imu == "used"
+        if pose.valid:
+            self._observe_pose(pose)
 
     def _observe_pose(self, pose: PoseRecord) -> None:
         self._pose_stamps.append(pose.stamp_ns)

@@ -29,6 +29,7 @@ _BYTE: Final = re.compile(r"'([0-9a-fA-F]{1,2})'")
 _INTEGER: Final = re.compile(r"[+-]?\d{1,20}")
 _HEX: Final = re.compile(r"0[xX][0-9a-fA-F]{1,16}")
 _REAL: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_PLAIN_NUMBERS: Final = re.compile(r"[+-]?\d{1,15}(?:\.\d{1,15})?(?:,[+-]?\d{1,15}(?:\.\d{1,15})?)*")
 _UNSAFE: Final = re.compile(r'[^ -~]|[\\"%~]')
 
 
@@ -292,6 +293,8 @@ def _verify_checksum(header: re.Match[str], *, needed: bool) -> None:
 def _decode_values(text: str) -> tuple[int | float | str, ...]:
     if not text:
         return ()
+    if _PLAIN_NUMBERS.fullmatch(text):  # nearly all replies
+        return tuple([float(value) if "." in value else int(value) for value in text.split(",")])
     if '"' not in text:
         return tuple(map(_decode_value, text.split(",")))
     values: list[int | float | str] = []
@@ -314,7 +317,7 @@ def _decode_values(text: str) -> tuple[int | float | str, ...]:
 
 def _decode_value(text: str) -> int | float:
     text = text.strip()
-    if "." not in text and _INTEGER.fullmatch(text):
+    if _INTEGER.fullmatch(text):
         return int(text)
     if _REAL.fullmatch(text):
         number = float(text)

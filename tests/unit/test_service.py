@@ -118,6 +118,16 @@ def test_notification_without_systemd_has_no_effect(monkeypatch: pytest.MonkeyPa
     assert logs == []
 
 
+def test_status_is_composed_for_systemd_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without systemd nobody reads it."""
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+
+    def status() -> str:
+        pytest.fail("composed")
+
+    sd_notify("WATCHDOG=1", status=status)
+
+
 def test_failing_notification_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The service continues."""
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))

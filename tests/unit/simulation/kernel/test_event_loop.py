@@ -374,14 +374,19 @@ def test_blocked_executor_work_continues_later() -> None:
     assert timeline.now_ns() == HOUR_NS
 
 
-def test_suspended_tasks_stand_still() -> None:
+@pytest.mark.parametrize("sleeps", ["on the loop", "on a clock"])
+def test_suspended_tasks_stand_still(sleeps: str) -> None:
     """Those of one context, their timers and wake-ups included; on resumption they run in their order."""
     suspended: ContextVar[bool] = ContextVar("suspended")
     ticks: list[float] = []
 
     async def tick(loop: asyncio.AbstractEventLoop) -> None:
+        clock = VirtualClock(0)
         while True:
-            await asyncio.sleep(1.0)
+            if sleeps == "on a clock":
+                await clock.sleep_until(clock.monotonic_ns() + 1_000_000_000)
+            else:
+                await asyncio.sleep(1.0)
             ticks.append(loop.time())
 
     async def main() -> None:
@@ -394,7 +399,7 @@ def test_suspended_tasks_stand_still() -> None:
         resume = loop.suspend(lambda context: context.get(suspended, False))
         await asyncio.sleep(10.0)
         resume()
-        await asyncio.sleep(2.0)
+        await asyncio.sleep(1.9)  # not at the instant of a tick
         ticking.cancel()
 
     run_virtual(main, isolated=True)

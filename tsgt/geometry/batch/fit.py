@@ -30,13 +30,7 @@ from tsgt.geometry.rest import (
     steps_in_rest,
     with_vibration,
 )
-from tsgt.geometry.trajectory.gauss_newton import (
-    LOOSE_GAIN_TOLERANCE,
-    PREDICTED_GAIN_TOLERANCE,
-    knot_times,
-    nearest_knots,
-    solve,
-)
+from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest_knots, solve
 from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.query import Trajectory
@@ -55,13 +49,16 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
     from tsgt.geometry.trajectory.states import States
 
-KNOTS_PER_SEGMENT = 1024  # About two minutes of 3 stations at 2.5 Hz: their blocks fit into the cache
+KNOTS_PER_SEGMENT = (
+    1536  # Three and a half minutes of 3 stations at 2.5 Hz; overlaps add an eighth to the work
+)
 MAX_ADAPTED_ITERATIONS = (
     6  # From the solution before the last adaptation, which is close; two or three suffice
 )
-ADAPTATION_GAIN_TOLERANCE = 100.0
-"""As :data:`~tsgt.geometry.trajectory.gauss_newton.LOOSE_GAIN_TOLERANCE`, before all but the last adaptation: a third of a sigma for
-each of a thousand knots. The next solution relinearises, and the last one converges; the result differs by 0.01 sigmas at most.
+INITIAL_GAIN_PER_KNOT, ADAPTED_GAIN_PER_KNOT, FINAL_GAIN_PER_KNOT = 3.0, 0.1, 0.01
+"""Predicted gains per knot below which a step is the last one, without relinearisation: before the first adaptation, between
+adaptations, and after the last one. It moves a knot by 1.7, 0.3 and 0.1 sigmas. The next solution relinearises; the result
+differs from that of a search to convergence by 0.02 sigmas at most, by 0.001 as root mean square.
 """
 OVERLAP_KNOTS = 96  # Knots on either side of a segment that are solved with it and discarded
 
@@ -271,22 +268,26 @@ def _solve_adapting(
 ) -> _AdaptedSolution:
     """Solve, and adapt the process noise to the motion; arguments as for :func:`solve` and :func:`adapted_sigmas`."""
     sigmas = initial_sigmas
-    solution = solve(
-        observations, guess, prior, sigmas=sigmas, rest=rest, gain_tolerance=LOOSE_GAIN_TOLERANCE
-    )
+    tolerance = INITIAL_GAIN_PER_KNOT * len(guess)
+    solution = solve(observations, guess, prior, sigmas=sigmas, rest=rest, gain_tolerance=tolerance)
     for last in (*[False] * (ADAPTATIONS - 1), True):
-        marginals = solution.factor.marginals()
         sigmas = adapted_sigmas(
-            solution, *marginals, sigmas=sigmas, initial_sigmas=initial_sigmas, adaptable=adaptable
+            solution,
+            *solution.factor.marginals(),
+            sigmas=sigmas,
+            initial_sigmas=initial_sigmas,
+            adaptable=adaptable,
         )
+        knots = solution.knots
+        del solution  # Its factor would be kept beside that of the next one
         solution = solve(
             observations,
-            solution.knots,
+            knots,
             prior,
             sigmas=sigmas,
             rest=rest,
             max_iterations=MAX_ADAPTED_ITERATIONS,
-            gain_tolerance=PREDICTED_GAIN_TOLERANCE if last else ADAPTATION_GAIN_TOLERANCE,
+            gain_tolerance=(FINAL_GAIN_PER_KNOT if last else ADAPTED_GAIN_PER_KNOT) * len(guess),
         )
     return _AdaptedSolution(solution, *solution.factor.marginals(), sigmas)
 

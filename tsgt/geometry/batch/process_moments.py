@@ -14,6 +14,9 @@ from tsgt.geometry.trajectory.states import linearise_process
 if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.gauss_newton import Solution
+    from tsgt.geometry.trajectory.states import ProcessFactors, States
+
+_STEPS_PER_CHUNK = 256  # Stay in the L2 cache: twice as fast
 
 ProcessMoments = tuple["FloatArray", "FloatArray", "FloatArray"]
 
@@ -21,40 +24,71 @@ ProcessMoments = tuple["FloatArray", "FloatArray", "FloatArray"]
 def expected_moments(
     solution: Solution, covariance: FloatArray, cross_covariance: FloatArray
 ) -> ProcessMoments:
-    """(K - 1, 6, 3, 3) second moments by process factor and axis: of the later state, later with earlier, of the earlier."""
-    linearised = linearise_process(solution.knots, solution.process)
+    """(K - 1, 6, 3, 3) second moments by process factor and axis: of the later state, later with earlier, of the earlier.
+
+    The later state is relative to the earlier knot, of which only velocity and acceleration count: the residual is
+    ``later - Phi earlier``.
+    """
+    chunks = [
+        _expected_moments(
+            solution.knots.select(slice(start, start + _STEPS_PER_CHUNK + 1)),
+            solution.process.select(slice(start, start + _STEPS_PER_CHUNK)),
+            covariance[start : start + _STEPS_PER_CHUNK + 1],
+            cross_covariance[start : start + _STEPS_PER_CHUNK],
+        )
+        for start in range(0, len(cross_covariance), _STEPS_PER_CHUNK)
+    ]
+    moments, cross, earlier = (np.concatenate(each) for each in zip(*chunks, strict=True))
+    return moments, cross, earlier
+
+
+def _expected_moments(
+    knots: States, process: ProcessFactors, covariance: FloatArray, cross_covariance: FloatArray
+) -> ProcessMoments:
+    linearised = linearise_process(knots, process)
     count = len(cross_covariance)
     earlier, later = linearised.earlier, linearised.later
     moments = later[..., :, None] * later[..., None, :]
     cross = later[..., :, None] * earlier[..., None, :]
     earlier_earlier = earlier[..., :, None] * earlier[..., None, :]
-    # The residual is later - Phi earlier; position and rotation are relative to the earlier knot.
-    by_earlier, by_later = np.zeros((2, count, 9, 9)), np.zeros((2, count, 9, 9))
-    by_earlier[0, :, range(3), range(3)] = -1.0
-    by_earlier[1, :, :3, :6] = linearised.rotation_by_earlier
-    by_later[:, :, range(9), range(9)] = 1.0
-    by_later[1, :, :3, :6] = linearised.rotation_by_later
+    blocks = [
+        matrix.reshape(count, 3, 2, 3, 3, 2, 3)
+        for matrix in (covariance[:-1], covariance[1:], cross_covariance)
+    ]
     for kind, axes in ((0, slice(0, 3)), (1, slice(3, 6))):
-        first, last, coupling = (
-            matrix.reshape(count, 3, 2, 3, 3, 2, 3)[:, :, kind, :, :, kind].reshape(count, 9, 9)
-            for matrix in (covariance[:-1], covariance[1:], cross_covariance)
-        )
-        cov_with_earlier = by_earlier[kind] @ first + by_later[kind] @ np.swapaxes(coupling, 1, 2)
-        cov_with_later = by_earlier[kind] @ coupling + by_later[kind] @ last
-        both = cov_with_earlier @ np.swapaxes(by_earlier[kind], 1, 2) + cov_with_later @ np.swapaxes(
-            by_later[kind], 1, 2
-        )
-        moments[:, axes] += _axis_blocks(both)
-        cross[:, axes] += _axis_blocks(cov_with_earlier)
-        earlier_earlier[:, axes] += _axis_blocks(first)
+        first, last, both = (_axis_blocks(matrix[:, :, kind, :, :, kind]) for matrix in blocks)
+        moments[:, axes] += last
+        cross[:, axes] += np.swapaxes(both, 2, 3)
+        earlier_earlier[:, axes] += first
+        if kind == 0:
+            # The position relative to the earlier one.
+            moments[:, axes, 0] -= both[:, :, 0]
+            moments[:, axes, :, 0] -= both[:, :, 0]
+            moments[:, axes, 0, 0] += first[:, :, 0, 0]
+            cross[:, axes, 0] -= first[:, :, 0]
+    # The rotation vector from the earlier rotation depends on both rotations and angular velocities; 9 errors of each knot.
+    first, last, both = (matrix[:, :, 1, :, :, 1].reshape(count, 9, 9) for matrix in blocks)
+    by_earlier, by_later = linearised.rotation_by_earlier, linearised.rotation_by_later
+    with_earlier = by_earlier @ first[:, :6] + by_later @ np.swapaxes(both[:, :, :6], 1, 2)
+    with_later = by_earlier @ both[:, :6] + by_later @ last[:, :6]
+    variance = (with_earlier[:, :, :6] * by_earlier + with_later[:, :, :6] * by_later).sum(axis=2)
+    by_axis_earlier, by_axis_later = (
+        np.einsum("naja->naj", each.reshape(count, 3, 3, 3)) for each in (with_earlier, with_later)
+    )
+    rotation = later[:, 3:, 0]
+    moments[:, 3:, 0, 0] = rotation**2 + variance
+    for component in (1, 2):
+        moments[:, 3:, 0, component] = rotation * later[:, 3:, component] + by_axis_later[:, :, component]
+        moments[:, 3:, component, 0] = moments[:, 3:, 0, component]
+        cross[:, 3:, 0, component] = rotation * earlier[:, 3:, component] + by_axis_earlier[:, :, component]
     cross[..., :, 0] = 0.0
     earlier_earlier[..., :, 0] = earlier_earlier[..., 0, :] = 0.0
     return moments, cross, earlier_earlier
 
 
 def _axis_blocks(matrix: FloatArray) -> FloatArray:
-    """(N, 3, 3, 3) diagonal axis blocks of (N, 9, 9)."""
-    blocks: FloatArray = np.einsum("niaja->naij", matrix.reshape(-1, 3, 3, 3, 3))
+    """(N, 3, 3, 3) view of (N, 3, 3, 3, 3), component and axis of rows and columns: the blocks of one axis with itself."""
+    blocks: FloatArray = np.einsum("niaja->naij", matrix)
     return blocks
 
 

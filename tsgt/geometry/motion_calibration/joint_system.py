@@ -133,8 +133,7 @@ def eliminate_trajectory(
     ``by_setup``: (M, 3, G) Jacobian of the residuals at the solution.
     """
     information, cross, gradient = _normal_equations(observations, solution, by_setup)
-    schur = information - np.tensordot(cross, solution.factor.solve(cross), axes=((0, 1), (0, 1)))
-    return SegmentInformation(schur, gradient)
+    return SegmentInformation(information - solution.factor.quadratic_form(cross), gradient)
 
 
 def _normal_equations(

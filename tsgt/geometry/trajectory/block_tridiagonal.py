@@ -12,7 +12,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.linalg.lapack import dpbtrf, dpbtrs, dtrtri
+from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
 from tsgt.errors import GeometryError
 
@@ -35,6 +35,11 @@ class BlockCholesky:
         """Solve for one right-hand side, (K, B), or several, (K, B, N); the result has the same shape."""
         solution, _ = dpbtrs(self.banded, right.reshape(self.banded.shape[1], -1), lower=True)
         return np.asarray(solution).reshape(right.shape)
+
+    def quadratic_form(self, right: FloatArray) -> FloatArray:
+        """(N, N) product of N right-hand sides, (K, B, N), transposed, with their solutions: half the work of solving for them."""
+        forward, _ = dtbtrs(self.banded, right.reshape(self.banded.shape[1], -1), uplo="L")
+        return np.asarray(forward.T @ forward)
 
     def log_determinant(self) -> float:
         """Natural logarithm of the determinant of the matrix."""
@@ -67,16 +72,22 @@ class BlockCholesky:
         size, count = self.size, self.banded.shape[1] // self.size
         columns = self.banded.T.reshape(count, size, 2 * size)
         diagonal, off_diagonal = np.empty((count, size, size)), np.empty((count - 1, size, size))
-        next_block: FloatArray | None = None
+        next_block, added = np.zeros((size, size)), np.empty((size, size))
         for start in range((count - 1) // _BLOCKS_PER_CHUNK * _BLOCKS_PER_CHUNK, -1, -_BLOCKS_PER_CHUNK):
-            inverse, sub_diagonal = _inverse_and_sub_diagonal(columns[start : start + _BLOCKS_PER_CHUNK])
-            own, gain = inverse.swapaxes(1, 2) @ inverse, np.swapaxes(-sub_diagonal @ inverse, 1, 2)
-            for k in range(len(own) - 1, -1, -1):
-                if next_block is not None:
-                    cross = np.dot(gain[k], next_block, out=off_diagonal[start + k])
-                    own[k] += np.dot(cross, gain[k].T)
-                next_block = own[k]
-            diagonal[start : start + len(own)] = 0.5 * (own + own.swapaxes(1, 2))
+            chunk = slice(start, start + _BLOCKS_PER_CHUNK)
+            inverse, sub_diagonal = _inverse_and_sub_diagonal(columns[chunk])
+            own, gain_transposed = inverse.swapaxes(1, 2) @ inverse, -sub_diagonal @ inverse
+            gain = gain_transposed.swapaxes(1, 2)
+            cross = np.empty_like(own)
+            # Lists of views: to index the arrays in the loop takes as long as the products.
+            blocks = zip(*(list(each)[::-1] for each in (gain, gain_transposed, own, cross)), strict=True)
+            for block_gain, block_gain_transposed, block, block_cross in blocks:
+                np.dot(block_gain, next_block, block_cross)
+                np.dot(block_cross, block_gain_transposed, added)
+                np.add(block, added, block)
+                next_block = block
+            off_diagonal[chunk] = cross[: len(off_diagonal[chunk])]
+            diagonal[chunk] = 0.5 * (own + own.swapaxes(1, 2))
         return diagonal, off_diagonal
 
 
@@ -108,13 +119,18 @@ def factorise(diagonal: FloatArray, off_diagonal: FloatArray) -> BlockCholesky:
     count, size, _ = diagonal.shape
     # LAPACK's band storage is column by column, each from the diagonal down: a column of both blocks, one below the other, and
     # zeros, from its own number on.
-    full = np.zeros((count, size, 3 * size))
-    full[:, :, :size] = diagonal.swapaxes(1, 2)
-    full[:-1, :, size : 2 * size] = off_diagonal
+    columns = np.empty((count, size, 2 * size))
+    full = np.zeros((min(count, _BLOCKS_PER_CHUNK), size, 3 * size))
     of_block, of_column, of_row = full.strides
-    columns = np.lib.stride_tricks.as_strided(
-        full, (count, size, 2 * size), (of_block, of_column + of_row, of_row), writeable=False
-    ).copy()
+    from_diagonal = np.lib.stride_tricks.as_strided(
+        full, (len(full), size, 2 * size), (of_block, of_column + of_row, of_row), writeable=False
+    )
+    for start in range(0, count, _BLOCKS_PER_CHUNK):
+        blocks, below = (each[start : start + _BLOCKS_PER_CHUNK] for each in (diagonal, off_diagonal))
+        full[: len(blocks), :, :size] = blocks.swapaxes(1, 2)
+        full[: len(below), :, size : 2 * size] = below
+        full[len(below) :, :, size : 2 * size] = 0.0
+        columns[start : start + len(blocks)] = from_diagonal[: len(blocks)]
     # LAPACK directly: scipy's checks cost more than a system of the fixed lag, of which there are a dozen a second.
     factor, failed = dpbtrf(columns.reshape(count * size, 2 * size).T, lower=True, overwrite_ab=True)
     if failed:

@@ -105,6 +105,12 @@ class NormalEquations(NamedTuple):
     linearised: LinearisedMeasurements
     whitened: FloatArray  # (M, 3, 19) whitened Jacobians and residuals, without the robust weights
 
+    def factorised(self) -> tuple[BlockCholesky, NormalEquations]:
+        """Factor of the matrix, and the equations without it: two matrices of a long trajectory take most of the memory."""
+        factor = factorise(self.diagonal, self.off_diagonal)
+        nothing = np.empty((0, STATE_DIM, STATE_DIM))
+        return factor, self._replace(diagonal=nothing, off_diagonal=nothing)
+
 
 def knot_times(time_s: FloatArray, *, min_spacing_s: float = MIN_KNOT_SPACING_S) -> FloatArray:
     """Choose knot times for measurements at times ``time_s``, (M,), in increasing order, at least one."""
@@ -202,8 +208,7 @@ def _minimise(
         return assemble(observations, knot_index, knots, process, anchor, rejectable=rejectable)
 
     iterations = 0
-    system = evaluate(knots)
-    factor = factorise(system.diagonal, system.off_diagonal)
+    factor, system = evaluate(knots).factorised()
     while iterations < max_iterations:
         iterations += 1
         step = factor.solve(-system.gradient)
@@ -214,8 +219,9 @@ def _minimise(
         if candidate is None:
             break
         decrease = system.cost - candidate.cost
-        knots, system = candidate_knots, candidate
-        factor = factorise(system.diagonal, system.off_diagonal)
+        knots = candidate_knots
+        factor, system = candidate.factorised()
+        del candidate
         if decrease < COST_TOLERANCE:
             break
     found = system.squared_distances, system.weights, system.linearised, knot_index, system.cost

@@ -44,6 +44,16 @@ def test_solve_agrees_with_dense(count: int, size: int) -> None:
 
 
 @pytest.mark.parametrize(("count", "size"), SHAPES)
+def test_quadratic_form_agrees_with_dense(count: int, size: int) -> None:
+    """Of several right-hand sides with each other."""
+    diagonal, off_diagonal, whole = random_system(count, size)
+    right = np.random.default_rng(0).normal(size=(count, size, 3))
+    flat = right.reshape(-1, 3)
+    found = factorise(diagonal, off_diagonal).quadratic_form(right)
+    np.testing.assert_allclose(found, flat.T @ np.linalg.solve(whole, flat), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(("count", "size"), SHAPES)
 def test_marginals_are_blocks_of_the_inverse(count: int, size: int) -> None:
     """Marginals and cross-covariances are the inverse's blocks."""
     diagonal, off_diagonal, whole = random_system(count, size)

@@ -11,15 +11,12 @@ import click
 import numpy as np
 
 import tsgt
-from tsgt.analysis.evaluation import noise_scales_by_axis, read_tum
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.refinement import Refine
-from tsgt.analysis.setup_replacement import with_calibration, with_imu_mounting, with_layout
 from tsgt.cli.options import path_type, resolved_point
 from tsgt.cli.output import report_problem
 from tsgt.clock import SystemClock
-from tsgt.config import load_imu_mounting, load_prism_layout, load_station_calibration
 from tsgt.errors import InputFileError
 from tsgt.model import OdometryParameters
 from tsgt.recording import (
@@ -135,6 +132,9 @@ class ImuOptions:
         if self.left_out:
             parameters = dataclasses.replace(parameters, imu=None)
         if self.setup is not None:
+            from tsgt.analysis.setup_replacement import with_imu_mounting
+            from tsgt.config import load_imu_mounting
+
             parameters = with_imu_mounting(parameters, load_imu_mounting(self.setup), path=self.setup)
         if self.odometry is not None:
             parameters = dataclasses.replace(parameters, odometry=parameters.odometry or OdometryParameters())
@@ -181,8 +181,14 @@ def load(
             raise click.UsageError(
                 f"{path} holds points in the frame of station 1, no raw measurements: --frames has no effect"
             )
+        from tsgt.analysis.setup_replacement import with_calibration
+        from tsgt.config import load_station_calibration
+
         parameters = with_calibration(parameters, load_station_calibration(frames), path=frames)
     if prisms is not None:
+        from tsgt.analysis.setup_replacement import with_layout
+        from tsgt.config import load_prism_layout
+
         parameters = with_layout(parameters, load_prism_layout(prisms), path=prisms)
     parameters = dataclasses.replace(parameters, no_poses=None)
     if point is not None:
@@ -212,6 +218,8 @@ def load_reference(
     """Read a reference trajectory, of the point that is given or else of that which the file states."""
     if path is None:
         return None
+    from tsgt.analysis.evaluation import read_tum
+
     reference = read_tum(path)
     if point is None:
         return reference
@@ -242,6 +250,8 @@ def duration_s(poses: PoseBatch) -> float:
 
 def motion_keys(found: SmoothedPoses) -> dict[str, Any]:
     """Return motion prior and noise scales for ``--json``."""
+    from tsgt.analysis.evaluation import noise_scales_by_axis
+
     motion = found.motion
     return {
         "motion": dataclasses.asdict(motion.prior),

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.config import load_prism_layout
 from tsgt.errors import DegenerateGeometryError, InputFileError, quoted
 from tsgt.geometry import check_layout
 from tsgt.model import MAX_COORDINATE_M, PrismPosition
@@ -91,9 +90,12 @@ def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPo
     in m in the robot frame, the rest is ignored; or from a ``.toml`` of kind ``prism_layout``. Raises InputFileError if a
     row or a number is missing, or the prisms coincide or lie in a line; ConfigError if the set-up file cannot be used.
     """
-    positions = (
-        load_prism_layout(path).positions_m if path.suffix == ".toml" else _read_sensor_positions(path)
-    )
+    if path.suffix == ".toml":
+        from tsgt.config import load_prism_layout  # noqa: PLC0415 (a tenth of the start-up of `tsgt process`)
+
+        positions = load_prism_layout(path).positions_m
+    else:
+        positions = _read_sensor_positions(path)
     missing = [prism for prism in numbers if prism not in positions]
     if missing:
         raise InputFileError(

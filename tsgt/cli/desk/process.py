@@ -129,26 +129,18 @@ def process(
             else:
                 source = f"process: {recording.name}"
                 write_recording(output, source=source, parameters=parameters, records=records)
-    result: dict[str, Any] = {
-        "estimator": parameters.pipeline.estimator,
-        "reference_point": dataclasses.asdict(poses.reference_point),
-        **pose_counts(poses),
-        "seconds": time.perf_counter() - started_s,
-        "duration_s": duration_s(poses),
-        "measurements": len(loaded.measurements),
-        **(
-            {}
-            if continuous is None
-            else {
-                **motion_keys(continuous),
-                **imu_keys(continuous.imu, continuous.imu_problem),
-                **refinement_keys(continuous.refinement, continuous.parameters),
-                "rest_s": continuous.rest_s,
-            }
-        ),
-    }
     if as_json:
-        print_json(result)
+        print_json(
+            {
+                "estimator": parameters.pipeline.estimator,
+                "reference_point": dataclasses.asdict(poses.reference_point),
+                **pose_counts(poses),
+                "seconds": time.perf_counter() - started_s,
+                "duration_s": duration_s(poses),
+                "measurements": len(loaded.measurements),
+                **({} if continuous is None else _continuous_keys(continuous)),
+            }
+        )
         return
     at = point_label(poses.reference_point)
     click.echo(f"{output}: {pose_summary(poses)} from {len(loaded.measurements)} measurements, at {at}")
@@ -160,6 +152,16 @@ def process(
         click.echo(motion_text(continuous, loaded.parameters.pipeline.motion))
         if continuous.imu is None:
             click.echo(f"At rest: {continuous.rest_s:.1f} s in {len(continuous.rest)} intervals")
+
+
+def _continuous_keys(continuous: SmoothedPoses) -> dict[str, Any]:
+    """Return for ``--json`` what the poses of ``continuous`` were computed with."""
+    return {
+        **motion_keys(continuous),
+        **imu_keys(continuous.imu, continuous.imu_problem),
+        **refinement_keys(continuous.refinement, continuous.parameters),
+        "rest_s": continuous.rest_s,
+    }
 
 
 def _processed(

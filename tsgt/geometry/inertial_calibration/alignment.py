@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.fft import irfft, next_fast_len, rfft
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.rigid import matvec
@@ -178,6 +177,8 @@ def _rate_scores(
     robot: Series, imu: Series, max_latency_s: float, min_overlap_s: float
 ) -> tuple[NDArray[np.intp], FloatArray]:
     """Shifts of the IMU's grid against the robot's, in steps, and the correlation of the rates, aligned, at each."""
+    from scipy.fft import irfft, next_fast_len, rfft  # noqa: PLC0415 (programs without an IMU start without it)
+
     lags = np.arange(-len(robot.rate) + 1, len(imu.rate))
     known, theirs = robot.known.astype(np.float64), imu.known.astype(np.float64)
     a, b = robot.rate * known[:, None], imu.rate * theirs[:, None]

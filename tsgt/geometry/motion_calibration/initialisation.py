@@ -10,7 +10,6 @@ from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.rigid import exp_so3, rotate
@@ -63,6 +62,8 @@ def frames_from_motion(observations: Observations) -> FloatArray:
             for track, parameters in zip(tracks[1:], unknowns.reshape(-1, 4), strict=True)
         ]
         return np.concatenate([pair.residuals_m(points_m) for pair in pairs])
+
+    from scipy.optimize import least_squares  # noqa: PLC0415 (a tenth of the start-up of `tsgt process`)
 
     found = least_squares(
         residuals_m,

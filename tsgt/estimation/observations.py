@@ -18,10 +18,10 @@ from tsgt.geometry.trajectory import Observations
 from tsgt.model import PointMeasurement, PolarMeasurement
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from tsgt.geometry import FloatArray
-    from tsgt.model import InstrumentNoise, Measurement, Parameters, StationParameters
+    from tsgt.model import Measurement, Parameters, StationParameters
 
 INSTRUMENT_TIME_SIGMA_S = 6e-4
 FIRST_TIME_SIGMA_S = 3e-3
@@ -62,32 +62,20 @@ def build_observations(
         if usable(measurement) and has_plausible_time(measurement, station):
             timed.setdefault((measured_at_ns(measurement, station), row), measurement)
     ordered = sorted(timed.items(), key=lambda item: item[0])
-    points, sigmas = np.empty((len(ordered), 3)), np.empty((len(ordered), 3))
-    for i, ((_, row), measurement) in enumerate(ordered):
-        station = parameters.stations[row]
-        if isinstance(measurement, PolarMeasurement):
-            assert measurement.slope_distance_m is not None  # noqa: S101 (it is usable)
-            distance_m = float(
-                corrected_distance(
-                    measurement.slope_distance_m,
-                    constant_m=station.prism_constant_m,
-                    ppm=station.atmospheric_ppm,
-                )
-            )
-            angles_rad = corrected_angles(
-                measurement.horizontal_angle_rad,
-                measurement.zenith_angle_rad,
-                vertical_index_rad=station.vertical_index_rad,
-                collimation_rad=station.collimation_rad,
-            )
-            points[i] = polar_to_cartesian(*angles_rad, distance_m)
-            sigmas[i] = _sigmas_m(station.noise, distance_m)
-        else:
-            points[i] = measurement.position_m
-            # The direction of the line of sight is unknown, so the range noise applies to all three axes.
-            sigmas[i] = np.hypot(station.noise.range_sigma_m, station.noise.pointing_sigma_m)
     sources = [measurement for _, measurement in ordered]
     is_point = np.array([isinstance(m, PointMeasurement) for m in sources], dtype=bool)
+    points, sigmas = np.empty((len(ordered), 3)), np.empty((len(ordered), 3))
+    polar: dict[int, list[int]] = {}
+    for i, ((_, row), measurement) in enumerate(ordered):
+        if isinstance(measurement, PolarMeasurement):
+            polar.setdefault(row, []).append(i)
+            continue
+        points[i] = measurement.position_m
+        # The direction of the line of sight is unknown, so the range noise applies to all three axes.
+        noise = parameters.stations[row].noise
+        sigmas[i] = np.hypot(noise.range_sigma_m, noise.pointing_sigma_m)
+    for row, own in polar.items():
+        points[own], sigmas[own] = _polar_points(parameters.stations[row], [sources[i] for i in own])
     # Cartesian points are already in frame 1, whatever their station: the row after the stations' frames.
     layout = _layout(parameters)
     frames = np.array([*(s.T_station1_station for s in parameters.stations), np.eye(4)])
@@ -135,10 +123,35 @@ def _layout(parameters: Parameters) -> FloatArray:
     return np.array([prism.position_m for prism in parameters.prisms], dtype=np.float64)
 
 
-def _sigmas_m(noise: InstrumentNoise, distance_m: float) -> tuple[float, float, float]:
-    """Return one sigma in m along the line of sight and in both directions across it."""
+def _polar_points(
+    station: StationParameters, measurements: Sequence[Measurement]
+) -> tuple[FloatArray, FloatArray]:
+    """Points in the station frame of a station's polar measurements, (M, 3) in m, and their sigmas, (M, 3).
+
+    Sigmas along the line of sight and in both directions across it.
+    """
+    raw = np.array(
+        [
+            (m.slope_distance_m, m.horizontal_angle_rad, m.zenith_angle_rad)
+            for m in measurements
+            if isinstance(m, PolarMeasurement)
+        ],
+        dtype=np.float64,
+    )
+    distance_m = corrected_distance(
+        raw[:, 0], constant_m=station.prism_constant_m, ppm=station.atmospheric_ppm
+    )
+    angles_rad = corrected_angles(
+        raw[:, 1],
+        raw[:, 2],
+        vertical_index_rad=station.vertical_index_rad,
+        collimation_rad=station.collimation_rad,
+    )
+    noise = station.noise
     along = np.sqrt(
         noise.range_sigma_m**2 + (noise.range_sigma_ppm * 1e-6 * distance_m) ** 2 + noise.pointing_sigma_m**2
     )
-    across = float(np.hypot(noise.angle_sigma_rad * distance_m, noise.pointing_sigma_m))
-    return float(along), across, across
+    across = np.hypot(noise.angle_sigma_rad * distance_m, noise.pointing_sigma_m)
+    sigmas = np.empty((len(raw), 3))
+    sigmas[:, 0], sigmas[:, 1:] = along, across[:, None]
+    return polar_to_cartesian(*angles_rad, distance_m), sigmas

@@ -1,4 +1,4 @@
-"""One hour of field work through `tsgt process`, from start-up to the TUM file: CPU time and peak memory.
+"""One hour of field work through `tsgt process`, from start-up to the TUM file, and `tsgt evaluate`: CPU time, peak memory.
 
 The recording is what a master would have written: measurements of three stations at 2.5 Hz, the poses that it
 streamed (which `process` reads past and computes again), and nothing else. For comparison, in the same run: what start-up
@@ -48,6 +48,7 @@ def main() -> None:
         with ProcessPoolExecutor(1) as pool:
             measurements = pool.submit(write_recording, recording).result()
         process_s, memory = best("-m", "tsgt", "process", str(recording), "--output", str(poses))
+        evaluate_s, evaluate_memory = best("-m", "tsgt", "evaluate", str(recording))
         start_s, start_memory = best(
             "-c", "import tsgt.analysis.processing, tsgt.analysis.formats.export, tsgt.cli.desk.process"
         )
@@ -59,6 +60,7 @@ def main() -> None:
     print(f"{'':34}{'CPU s':>8}{'peak MB':>9}")
     print(f"{'tsgt process to TUM, all of it':34}{process_s:8.2f}{memory:9.0f}")
     print(f"{'  of this start-up (imports)':34}{start_s:8.2f}{start_memory:9.0f}")
+    print(f"{'tsgt evaluate, all of it':34}{evaluate_s:8.2f}{evaluate_memory:9.0f}")
     print(f"{'json.loads of every line':34}{json_s:8.2f}")
     print(f"one hour of field work / CPU time of process: {DURATION_S / process_s:.0f}")
     print(f"process / json.loads of every line: {process_s / json_s:.2f}")

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-_IMU_START = b'{"type":"imu",'  # start of every line of the IMU as it is written
+# Start of every line as it is written, of the IMU and of poses
+_LINE_START = b'{"type":'
+_IMU_START, _POSE_START = _LINE_START + b'"imu",', _LINE_START + b'"pose",'
 
 S = TypeVar("S", ImuSamples, OdometrySamples)
 _TAGS: dict[type, str] = {ImuSamples: "imu", OdometrySamples: "odometry"}
@@ -66,12 +68,14 @@ def read_lines(
     path: Path,
     *,
     imu: bool = False,
+    poses: bool = True,
     keep_going: bool = False,
     on_problem: Callable[[RecordingError], None] | None = None,
 ) -> Iterator[Line]:
     """Yield the lines of a recording, headers included; each is checked to be JSON with a type.
 
     ``imu``: also yield the lines of the IMU, which are most of the bytes of a recording; skipping them costs little.
+    ``poses``: likewise the poses, most of the lines. Lines that are skipped are not checked, but for another line in them.
 
     ``keep_going``: skip lines that cannot be read instead of raising. ``on_problem``: called for each skipped line: a
     torn last line always, others with ``keep_going``.
@@ -86,8 +90,10 @@ def read_lines(
         A line is not JSON with a type, and ``keep_going`` is not set.
     """
     number = 0
+    skipped = tuple(start for start, wanted in ((_IMU_START, imu), (_POSE_START, poses)) if not wanted)
     for number, raw in enumerate(_raw_lines(path), start=1):
-        if not imu and number > 1 and raw.startswith(_IMU_START) and raw.endswith(b"\n"):
+        # Where the end of a line was lost, a measurement may follow in the same one.
+        if number > 1 and raw.startswith(skipped) and raw.endswith(b"}\n") and raw.find(_LINE_START, 1) < 0:
             continue
         data = raw.removesuffix(b"\n") if raw.endswith(b"\n") else raw.rstrip(b"\0")
         try:
@@ -137,7 +143,7 @@ def load_recording(
     left_out = 0
     replaced = new_session = False
     valid_from_ns = -(2**63)  # measurements before the last set-up arrive late or were merged
-    for line in read_lines(path, imu=imu, keep_going=keep_going, on_problem=on_problem):
+    for line in read_lines(path, imu=imu, poses=False, keep_going=keep_going, on_problem=on_problem):
         known_ns: int | None = None
         try:
             match line.type:

@@ -111,6 +111,24 @@ def test_lines_of_the_imu_are_for_those_who_ask(path: Path) -> None:
     assert list(read_imu_samples(path)) == [imu_samples(0), imu_samples(10)]
 
 
+def test_poses_are_skipped_for_those_who_need_none(path: Path) -> None:
+    """Other lines keep their numbers."""
+    path.write_bytes(recording_bytes(POSE, measurement(0), NO_POSE))
+    lines = read_lines(path, poses=False)
+    assert [(line.number, line.type) for line in lines][2:] == [(4, "measurement")]
+
+
+@pytest.mark.parametrize("before", [POSE, imu_samples(0)], ids=["pose", "imu"])
+@pytest.mark.parametrize("kept", [None, -20], ids=["whole", "cut"])
+def test_measurement_after_a_lost_line_end_is_not_skipped(
+    path: Path, before: object, kept: int | None
+) -> None:
+    """A measurement in the same line as a pose or samples of the IMU is a problem, although neither of them is read."""
+    path.write_bytes(recording_bytes() + encode_line(before)[:kept] + encode_line(measurement(0)) + b"\n")
+    with pytest.raises(CorruptLineError, match="line 3"):
+        load_recording(path)
+
+
 def test_torn_line_of_the_imu_is_reported(path: Path) -> None:
     """Like any other torn last line."""
     path.write_bytes(recording_bytes(imu_samples(0)) + encode_line(imu_samples(10))[:100])

@@ -30,7 +30,14 @@ from tsgt.geometry.rest import (
     steps_in_rest,
     with_vibration,
 )
-from tsgt.geometry.trajectory.gauss_newton import knot_times, nearest_knots, solve
+from tsgt.geometry.trajectory.gauss_newton import (
+    LOOSE_GAIN_TOLERANCE,
+    PREDICTED_GAIN_TOLERANCE,
+    REJECTION_THRESHOLD,
+    knot_times,
+    nearest_knots,
+    solve,
+)
 from tsgt.geometry.trajectory.initialisation import PrismTracks
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.query import Trajectory
@@ -55,10 +62,14 @@ KNOTS_PER_SEGMENT = (
 MAX_ADAPTED_ITERATIONS = (
     6  # From the solution before the last adaptation, which is close; two or three suffice
 )
-INITIAL_GAIN_PER_KNOT, ADAPTED_GAIN_PER_KNOT, FINAL_GAIN_PER_KNOT = 3.0, 0.1, 0.01
-"""Predicted gains per knot below which a step is the last one, without relinearisation: before the first adaptation, between
-adaptations, and after the last one. It moves a knot by 1.7, 0.3 and 0.1 sigmas. The next solution relinearises; the result
-differs from that of a search to convergence by 0.02 sigmas at most, by 0.001 as root mean square.
+ADAPTATION_GAIN_TOLERANCE = 100.0
+"""As :data:`~tsgt.geometry.trajectory.gauss_newton.LOOSE_GAIN_TOLERANCE`, before all but the last adaptation: a third of a sigma for
+each of a thousand knots. The next solution relinearises, and the last one converges; the result differs by 0.01 sigmas at most.
+"""
+INITIAL_GAIN_PER_KNOT, FINAL_GAIN_PER_KNOT = 3.0, 0.01
+"""The same per knot before the first adaptation, 1.7 sigmas, and after the last one, 0.1 sigmas, without blunders. The result
+differs by 0.02 sigmas at most, 0.0006 as root mean square. A blunder moves a few knots by many sigmas, and small steps decide
+whether it is rejected.
 """
 OVERLAP_KNOTS = 96  # Knots on either side of a segment that are solved with it and discarded
 
@@ -268,8 +279,21 @@ def _solve_adapting(
 ) -> _AdaptedSolution:
     """Solve, and adapt the process noise to the motion; arguments as for :func:`solve` and :func:`adapted_sigmas`."""
     sigmas = initial_sigmas
-    tolerance = INITIAL_GAIN_PER_KNOT * len(guess)
-    solution = solve(observations, guess, prior, sigmas=sigmas, rest=rest, gain_tolerance=tolerance)
+    solution = solve(
+        observations,
+        guess,
+        prior,
+        sigmas=sigmas,
+        rest=rest,
+        gain_tolerance=INITIAL_GAIN_PER_KNOT * len(guess),
+        reject_outliers=False,
+    )
+    final_tolerance = FINAL_GAIN_PER_KNOT * len(guess)
+    if (solution.squared_distances > REJECTION_THRESHOLD**2).any():
+        final_tolerance = PREDICTED_GAIN_TOLERANCE
+        solution = solve(
+            observations, guess, prior, sigmas=sigmas, rest=rest, gain_tolerance=LOOSE_GAIN_TOLERANCE
+        )
     for last in (*[False] * (ADAPTATIONS - 1), True):
         sigmas = adapted_sigmas(
             solution,
@@ -287,7 +311,7 @@ def _solve_adapting(
             sigmas=sigmas,
             rest=rest,
             max_iterations=MAX_ADAPTED_ITERATIONS,
-            gain_tolerance=(FINAL_GAIN_PER_KNOT if last else ADAPTED_GAIN_PER_KNOT) * len(guess),
+            gain_tolerance=final_tolerance if last else ADAPTATION_GAIN_TOLERANCE,
         )
     return _AdaptedSolution(solution, *solution.factor.marginals(), sigmas)
 

@@ -23,6 +23,7 @@ from tsgt.simulation.faults import (
     inject_fault,
     odometry_conditions,
     relock_instruments,
+    rollovers,
 )
 from tsgt.simulation.kernel import VirtualTimeline, run_virtual
 from tsgt.simulation.mission import DRAIN_S, Mission, MissionResult, Slew, has_odometry, listen_to_stream
@@ -77,6 +78,7 @@ def simulate(
             timeline=timeline,
             imu_conditions=imu_conditions(faults),
             odometry_conditions=odometry_conditions(faults),
+            rollovers=(rolled := rollovers(faults)),
         )
         for station in scenario.stations:
             mission.start_station(station.station)
@@ -89,7 +91,7 @@ def simulate(
             *(
                 inject_fault(mission, fault)
                 for fault in faults
-                if fault.kind not in IMU_FAULTS | ODOMETRY_FAULTS
+                if fault.kind not in IMU_FAULTS | ODOMETRY_FAULTS | {FaultKind.ROBOT_ROLLOVER}
             ),
             *([mission.run_interference()] if options.interference_rate_hz else []),
             *([relock_instruments(mission, options.duration_s - FAULT_FREE_TAIL_S)] if faults else []),
@@ -115,7 +117,7 @@ def simulate(
             await asyncio.gather(*fault_tasks, return_exceptions=True)
             await mission.stop_all()
         return MissionResult(
-            parameters=mission.parameters,
+            parameters=mission.first_parameters,
             world=mission.world,
             duration_s=options.duration_s,
             master_logs=[*mission.other_master_logs, *mission.master_logs],
@@ -129,6 +131,8 @@ def simulate(
                 for fault in faults
                 if fault.kind == FaultKind.NTP_SLEW and fault.station is not None
             ),
+            moves=tuple(mission.moves),
+            rollovers=rolled,
             knocks_s=tuple(fault.at_s for fault in faults if fault.kind == FaultKind.IMU_KNOCK),
             faults_end_s=options.duration_s - FAULT_FREE_TAIL_S if faults else None,
             rate_hz={station.station: station.rate_hz for station in scenario.stations},

@@ -8,7 +8,7 @@ splines. The splines are the ground truth: defined at every instant, and smooth.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -31,6 +31,21 @@ ROUTE_STEP_M = 0.05
 
 # A robot outside its area turns back at a rate of its heading error divided by this time.
 STEERING_TIME_CONSTANT_S = 1.0
+
+STOP_S = 1.0
+"""From driving to standing before a rollover, and from standing to driving after it."""
+
+HIDDEN_ROLL_RAD = math.radians(45.0)
+"""A robot that is rolled by more hides its prisms."""
+
+
+class Rollover(NamedTuple):
+    """The robot rolls over and lies until it is put on its wheels again; times in s."""
+
+    at_s: float  # it begins to roll
+    roll_s: float  # for how long it rolls over, and is rolled back at the end
+    until_s: float  # it stands on its wheels again; at least twice ``roll_s`` after ``at_s``
+    angle_rad: float  # roll while it lies, positive to the right
 
 
 class World:
@@ -74,6 +89,30 @@ class World:
         times_s = self._spline.x
         speed_mps = np.linalg.norm(self._spline(times_s, 1)[:, :2], axis=1)
         self.shaking = Shaking(config, pivot_m, times_s, speed_mps, generator)
+
+    def roll_over(self, rollovers: Sequence[Rollover], stations: Sequence[int]) -> None:
+        """Let the robot stop, roll over, lie with its prisms hidden from the stations, and drive on; before :meth:`shake`.
+
+        It rolls about its x axis and is lifted: its prisms, the highest at height h, are not below the ground.
+        """
+        times_s = self._spline.x
+        driven, rolled_rad = np.ones(len(times_s)), np.zeros(len(times_s))
+        for each in rollovers:
+            driven *= 1.0 - _smooth_step((times_s - each.at_s) / STOP_S + 1.0)
+            driven += _smooth_step((times_s - each.until_s) / STOP_S)
+            over = _smooth_step((times_s - each.at_s) / each.roll_s)
+            back = _smooth_step((times_s - each.until_s) / each.roll_s + 1.0)
+            rolled_rad += each.angle_rad * (over - back)
+        state = self._spline(np.minimum(np.cumsum(driven) * STEP_S - STEP_S, times_s[-1]))
+        state[:, 5] += rolled_rad
+        state[:, 2] += self.prisms_m[:, 2].max() * (1.0 - np.cos(rolled_rad)) / 2.0
+        self._spline = CubicSpline(times_s, state)
+        edges = np.flatnonzero(np.diff(np.abs(rolled_rad) > HIDDEN_ROLL_RAD))
+        hidden_s = times_s[edges[: len(edges) // 2 * 2] + 1].reshape(-1, 2)
+        self.occlusions_s = {
+            station: np.concatenate([self.occlusions_s.get(station, np.empty((0, 2))), hidden_s])
+            for station in stations
+        }
 
     def pose_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ``T_station1_robot`` at N instants in s from the start: (N, 4, 4).
@@ -133,6 +172,13 @@ def scenario_world(scenario: ScenarioConfig, duration_s: float, generator: np.ra
         motion_rng,
         draw_occlusions(scenario.occlusions, numbers, duration_s, occlusion_rng),
     )
+
+
+def _smooth_step(progress: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 to 1 while the progress does, with a continuous second derivative."""
+    x = np.clip(progress, 0.0, 1.0)
+    stepped: NDArray[np.float64] = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    return stepped
 
 
 def is_shaken(scenario: ScenarioConfig) -> bool:

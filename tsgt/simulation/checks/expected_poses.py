@@ -29,12 +29,13 @@ MIN_VALID_SHARE = 0.7
 def missing_poses(result: MissionResult) -> Iterator[str]:
     """Yield the masters' processes in a mission without faults that have fewer valid poses than their measurements allow.
 
-    Fewer than three stations need an IMU, whose set-up a drive has to confirm first: nothing is expected of them.
+    Fewer than three stations need an IMU, whose set-up a drive has to confirm first: nothing is expected of them, nor of stations
+    that have moved and contradict each other.
     """
-    if result.faults_end_s is not None or len(result.parameters.prisms) < MIN_PRISMS:
+    if result.faults_end_s is not None or result.moves or len(result.parameters.prisms) < MIN_PRISMS:
         return
     for master_log in result.master_logs:
-        expected = np.count_nonzero(_measured(master_log, result))
+        expected = len(measured_epochs(master_log, result))
         if expected < MIN_EXPECTED:
             continue
         poses = master_log.valid_poses()
@@ -52,8 +53,8 @@ def _series(master_log: MasterLog) -> list[str]:
     return [name for name in master_log.pose_counts if name in ("interpolated", "smoothed")]
 
 
-def _measured(master_log: MasterLog, result: MissionResult) -> NDArray[np.bool_]:
-    """Return for each epoch whether all prisms have a measurement before and after it, not too far from each other.
+def measured_epochs(master_log: MasterLog, result: MissionResult) -> NDArray[np.int64]:
+    """Return the epochs in ns at which all prisms have a measurement before and after, not too far from each other.
 
     One that took longer than the transport limit came too late.
     """
@@ -64,7 +65,7 @@ def _measured(master_log: MasterLog, result: MissionResult) -> NDArray[np.bool_]
         if usable(measurement) and measurement.prism in times_ns and delay_ns <= pipeline.transport_limit_ns:
             times_ns[measurement.prism].append(measurement.stamp_ns)
     if not all(times_ns.values()):
-        return np.zeros(0, dtype=np.bool_)
+        return np.zeros(0, dtype=np.int64)
     tracks = [np.sort(np.array(each, dtype=np.int64)) for each in times_ns.values()]
     begin_ns = max(int(track[0]) for track in tracks) + round(START_S * 1e9)
     epochs_ns = np.arange(
@@ -74,4 +75,4 @@ def _measured(master_log: MasterLog, result: MissionResult) -> NDArray[np.bool_]
     for track in tracks:
         after = track.searchsorted(epochs_ns)
         found &= track[after] - track[after - 1] <= pipeline.outage_limit_ns
-    return found
+    return epochs_ns[found]

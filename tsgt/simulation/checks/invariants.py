@@ -21,6 +21,7 @@ from tsgt.simulation.checks.covariance_scale import scale_failures
 from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.imu_samples import imu_failures, imu_status_failures
+from tsgt.simulation.checks.layout_events import layout_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.odometry_samples import odometry_failures
 from tsgt.simulation.checks.outstanding import outstanding_failures
@@ -83,6 +84,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
     - The recording is the stream, and the status counts what is on it.
     - A replay of the recording reproduces the stream.
     - Recorded samples of IMU and wheel odometry are those that they gave, at their true times; silent wheels are an event.
+    - A station that moves so that the prisms' triangle is distorted is an event.
     - After the faults, rates recover; collections in memory stay bounded.
     """
     found: list[Violation] = []
@@ -116,6 +118,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
         found += (
             Violation("event", what) for what in event_failures(master_log, superframe=result.superframe)
         )
+        found += (Violation("event", what) for what in layout_failures(master_log, result))
         found += duplicate_deliveries(master_log)
         found += timestamp_violations(
             master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)

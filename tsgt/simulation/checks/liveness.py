@@ -8,6 +8,7 @@ import numpy as np
 
 from tsgt.estimation import usable
 from tsgt.model import MIN_PRISMS
+from tsgt.simulation.checks.apparent_poses import apparent_poses
 from tsgt.simulation.faults import FaultKind
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ half minute after its master's start it has 0.39 to 0.80 with ``linear`` and 2 %
 costs 0.06, each of about five unanswered polls 0.03. Predicted poses do not count, because their validity depends on the
 age of the newest measurement.
 """
+
+MAX_MISFIT_M = 0.002
+"""No poses are expected if stations that have moved distort the prisms' triangle by more: the measurements contradict each other."""
 
 
 def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]) -> Iterator[str]:
@@ -73,6 +77,9 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
         protocol, stations=len(result.parameters.stations), knocked=FaultKind.IMU_KNOCK in result.faults
     )
     expected = seconds * 1e9 / result.parameters.pipeline.period_ns
+    misfit_m = apparent_poses(result, master_log, np.arange(from_s, to_s)).misfit_m
+    if misfit_m.max(initial=0.0) > MAX_MISFIT_M:
+        min_valid_share = 0.0
     if valid < min_valid_share * expected:
         yield (
             f"poses: {valid} of {expected:.0f} in the {seconds:g} s from {from_s:g} s on valid, "

@@ -9,6 +9,7 @@ import numpy as np
 from tsgt.estimation import build_tracks, centroid_at_point, centroid_m, transform_of, usable
 from tsgt.geometry import invert, log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MIN_PRISMS
+from tsgt.simulation.checks.apparent_poses import apparent_poses, misfit_tolerances
 from tsgt.simulation.faults import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD
 
 if TYPE_CHECKING:
@@ -35,11 +36,15 @@ _MAX_MEDIAN_NEES = 12.0
 # In m at the prisms' centroid and rad: limit of the median error of all but predicted poses; noise causes a fifth of it.
 MAX_MEDIAN_ERROR = 0.005
 MISALIGNMENT_SIGMAS = 3.0
+UNSEEN_S = 1.0
+"""Predictions go on for this long after the last measurement: the outage limit."""
+MAX_MISFIT_M = 0.001
+"""Poses are not in the medians if moved stations distort the prisms' triangle by more."""
 
 
 def pose_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
     """Yield the inconsistent valid poses of a master's process, one line each."""
-    yield from refit_mismatches(master_log, result.parameters)
+    yield from refit_mismatches(master_log, master_log.parameters or result.parameters)
     yield from nees_outliers(master_log, result)
     yield from distribution_failures(master_log, result)
 
@@ -67,16 +72,30 @@ def refit_mismatches(master_log: MasterLog, parameters: Parameters) -> Iterator[
 def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
     """Compare each valid pose of the estimator ``continuous`` with the truth and its covariance (NEES)."""
     poses = master_log.valid_poses()
-    poses = poses.select(poses.series != "interpolated")
-    errors, nees = _errors(poses, master_log, result)
+    poses = poses.select((poses.series != "interpolated") & ~rolls_over_unseen(poses, master_log, result))
+    errors, nees, misfits = _errors(poses, master_log, result)
     error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
-    limits = _STATE_TOLERANCE + untold_displacements(poses, master_log, result)
+    limits = _STATE_TOLERANCE + untold_displacements(poses, master_log, result) + misfits
     for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms > limits).any(axis=1)).tolist():
         yield (
             f"{poses.series[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "
             f"{error_norms[index, 1]:.4f} rad, limits {limits[index, 0]:.3g} and {limits[index, 1]:.3g}; "
             f"NEES {nees[index]:.0f}, limit {_MAX_NEES:g}"
         )
+
+
+def rolls_over_unseen(poses: ValidPoses, master_log: MasterLog, result: MissionResult) -> NDArray[np.bool_]:
+    """Whether each pose predicts, without an IMU, that a robot which begins to roll over drives on, (N,).
+
+    Its angular acceleration is twenty times that of the motion prior or more, and no measurement shows it yet.
+    """
+    at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
+    blind = (poses.series == "predicted") & ~poses.with_imu
+    rolling = np.zeros(len(at_s), dtype=np.bool_)
+    for each in result.rollovers:
+        rolling |= (at_s >= each.at_s) & (at_s < each.at_s + each.roll_s + UNSEEN_S)
+    found: NDArray[np.bool_] = blind & rolling
+    return found
 
 
 def untold_displacements(
@@ -109,12 +128,14 @@ def distribution_failures(master_log: MasterLog, result: MissionResult) -> Itera
     if any(station_log.folder is None for station_log in result.station_logs.values()):
         return
     every = master_log.valid_poses()
-    every = every.select(untold_displacements(every, master_log, result)[:, 1] == 0.0)
+    told = untold_displacements(every, master_log, result)[:, 1] == 0.0
+    told &= _errors(every, master_log, result)[2][:, 0] <= MAX_MISFIT_M
+    every = every.select(told)
     for series in np.unique(every.series).tolist():
         poses = every.select(every.series == series)
         if len(poses.stamp_ns) < _MIN_POSES:
             continue
-        errors, nees = _errors(poses, master_log, result)
+        errors, nees, _ = _errors(poses, master_log, result)
         median_nees = np.median(nees)
         median_m, median_rad = np.linalg.norm(np.median(errors, axis=0).reshape(2, 3), axis=1)
         limit_rad = max_median_rotation_rad(result.parameters)
@@ -140,19 +161,23 @@ def max_median_rotation_rad(parameters: Parameters) -> float:
 
 def _errors(
     poses: ValidPoses, master_log: MasterLog, result: MissionResult
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (N, 6) position errors at the prisms' centroid in m and rotation errors in rad, and the NEES of the poses, (N,).
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return (N, 6) position errors at the prisms' centroid in m and rotation errors in rad, the NEES, (N,), and what moved stations add.
 
-    Limits at the centroid do not depend on the reference point, whose lever arm magnifies rotation errors.
+    Limits at the centroid do not depend on the reference point, whose lever arm magnifies rotation errors. Errors are those from
+    what the stations show: that a station has moved is no error of the estimator; what it adds, (N, 2), is that of
+    :func:`misfit_tolerances`.
     """
-    truth = result.true_poses((poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9)
+    apparent = apparent_poses(result, master_log, (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9)
+    truth = apparent.T_station1_robot @ transform_of(result.parameters.reference_point)
     estimated = transform_from(rotation_from_quaternion(poses.orientation_xyzw), poses.position_m)
     rotation_error = log_so3(estimated[:, :3, :3] @ np.swapaxes(truth[:, :3, :3], 1, 2))
     errors = np.concatenate([poses.position_m - truth[:, :3, 3], rotation_error], axis=1)
     nees = np.einsum("ni,ni->n", errors, np.linalg.solve(poses.covariance, errors[..., None])[..., 0])
     centroid_m = centroid_at_point(result.parameters)
     at_centroid = transform_points(estimated, centroid_m) - transform_points(truth, centroid_m)
-    return np.concatenate([at_centroid, rotation_error], axis=1), nees
+    errors = np.concatenate([at_centroid, rotation_error], axis=1)
+    return errors, nees, misfit_tolerances(result, apparent)
 
 
 def _matches_refit(

@@ -9,6 +9,7 @@ import numpy as np
 from tsgt.estimation import transform_of, usable
 from tsgt.geometry import invert, rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MIN_PRISMS
+from tsgt.simulation.checks.apparent_poses import apparent_poses
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -62,7 +63,9 @@ def lateness_failures(
         at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
         estimated = transform_from(rotation_from_quaternion(poses.orientation_xyzw), poses.position_m)
         estimated = estimated @ invert(transform_of(parameters.reference_point))
-        truth, ahead = result.world.pose_at(at_s), result.world.pose_at(at_s + _STEP_S)
+        truth, ahead = (
+            apparent_poses(result, master_log, times_s).T_station1_robot for times_s in (at_s, at_s + _STEP_S)
+        )
         for prism, position_m in positions_m.items():
             true_m = transform_points(truth, position_m)
             velocity_mps = (transform_points(ahead, position_m) - true_m) / _STEP_S

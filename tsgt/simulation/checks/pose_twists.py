@@ -53,6 +53,12 @@ def twist_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str
         if len(poses.stamp_ns) < MIN_POSES:
             continue
         at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
+        upright = np.ones(len(at_s), dtype=np.bool_)
+        for each in (
+            result.rollovers
+        ):  # faster than anything that a robot does on purpose, and over as soon as it is seen
+            upright &= (at_s < each.at_s) | (at_s > each.until_s)
+        poses, at_s = poses.select(upright), at_s[upright]
         before, after = result.true_poses(at_s - _STEP_S), result.true_poses(at_s + _STEP_S)
         velocity_mps = (after[:, :3, 3] - before[:, :3, 3]) / (2 * _STEP_S)
         turned_rad = log_so3(np.swapaxes(before[:, :3, :3], 1, 2) @ after[:, :3, :3])

@@ -23,7 +23,8 @@ MIN_BEACONS, MAX_WRONG_SHARE = 10, 0.1
 
 def setup_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
     """Yield the stations and prisms that a published set-up places elsewhere than the parameters."""
-    frames = {each.station: np.array(each.T_station1_station) for each in result.parameters.stations}
+    parameters = master_log.parameters or result.parameters
+    frames = {each.station: np.array(each.T_station1_station) for each in parameters.stations}
     prisms = {each.prism: each.position_m for each in result.parameters.prisms}
     for setup in master_log.setups:
         for station in setup.stations:

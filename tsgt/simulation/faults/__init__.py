@@ -20,6 +20,7 @@ from tsgt.simulation.faults.computers import NTP_SLEW_PPM
 from tsgt.simulation.faults.imu_conditions import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD, imu_conditions
 from tsgt.simulation.faults.injection import inject_fault, relock_instruments
 from tsgt.simulation.faults.odometry_conditions import odometry_conditions
+from tsgt.simulation.faults.tripods import rollovers
 
 __all__ = [
     "FAST_SYNC_CYCLES",
@@ -39,4 +40,5 @@ __all__ = [
     "odometry_conditions",
     "parse_faults",
     "relock_instruments",
+    "rollovers",
 ]

@@ -138,6 +138,16 @@ class FaultKind(StrEnum):
     """A reflecting surface: an instrument follows the image of its prism, or distances are too long by centimetres to metres."""
     BATTERY_FADING = "battery-fading"
     """An instrument's battery runs down: it measures and responds more slowly, dies, and gets another one from an operator."""
+    TRIPOD_SINK = "tripod-sink"
+    """A tripod sinks, by 5 mm in an hour up to 5 mm in a minute."""
+    TRIPOD_KICK = "tripod-kick"
+    """A tripod is displaced by 1 to 50 mm and turned by 0.1 to 5 mrad at once, level or not."""
+    TRIPOD_SUN = "tripod-sun"
+    """The sun on one leg turns a tripod about the vertical by 10 to 100 microradians per minute."""
+    STATION_MOVED = "station-moved"
+    """A station is set up elsewhere with another horizontal zero, and calibrated some time later or never."""
+    ROBOT_ROLLOVER = "robot-rollover"
+    """The robot rolls over by 90 to 180 degrees, lies with its prisms hidden, and is put on its wheels again."""
 
 
 # Further kinds come last: the draws of the others stay the same. Kinds from SLOW_DISK on have a generator each.
@@ -210,6 +220,11 @@ _RATES: Final = {
     FaultKind.SECOND_ROBOT: _FaultRate(4, _S, (3, 40)),
     FaultKind.WINDOW: _FaultRate(8, _S, (0.5, 20)),
     FaultKind.BATTERY_FADING: _FaultRate(2, _S, (30, 150)),
+    FaultKind.TRIPOD_SINK: _FaultRate(4, _S, (30, 300)),
+    FaultKind.TRIPOD_KICK: _FaultRate(2, _S, (5, 40)),
+    FaultKind.TRIPOD_SUN: _FaultRate(4, _S, (30, 300)),
+    FaultKind.STATION_MOVED: _FaultRate(2, _S, (20, 90)),
+    FaultKind.ROBOT_ROLLOVER: _FaultRate(4, _M, (5, 40)),
 }
 
 _SWITCHED_ON: Final = frozenset({FaultKind.POWER, FaultKind.BATTERY_FADING})
@@ -242,6 +257,11 @@ FIELD_DAY_FAULTS: Final = frozenset(
         FaultKind.SECOND_MASTER,
         FaultKind.SECOND_ROBOT,
         FaultKind.WINDOW,
+        FaultKind.TRIPOD_SINK,
+        FaultKind.TRIPOD_KICK,
+        FaultKind.TRIPOD_SUN,
+        FaultKind.STATION_MOVED,
+        FaultKind.ROBOT_ROLLOVER,
     }
 )
 """Kinds that are injected by name only: what they violate is bounded, or they need a mission of their own."""

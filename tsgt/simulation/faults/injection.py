@@ -14,6 +14,7 @@ from tsgt.simulation.faults.catalogue import RELOCK_DELAY_S, FaultKind
 from tsgt.simulation.faults.computers import COMPUTER_INJECTORS
 from tsgt.simulation.faults.optics import OPTICS_INJECTORS
 from tsgt.simulation.faults.setup_mistakes import MISTAKE_INJECTORS
+from tsgt.simulation.faults.tripods import TRIPOD_INJECTORS
 from tsgt.simulation.instrument import LineFault, Lock
 from tsgt.simulation.kernel import DriftingClock
 from tsgt.simulation.lora.adversary import MAX_NOISE_BYTES, ReplayAttacker
@@ -345,4 +346,5 @@ _INJECTORS: Final[Mapping[FaultKind, Callable[[Mission, Fault, np.random.Generat
     **COMPUTER_INJECTORS,
     **MISTAKE_INJECTORS,
     **OPTICS_INJECTORS,
+    **TRIPOD_INJECTORS,
 }

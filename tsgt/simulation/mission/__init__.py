@@ -13,6 +13,7 @@ from tsgt.simulation.mission.run_log import (
     MissionResult,
     Slew,
     StationLog,
+    StationMove,
     ValidPoses,
 )
 from tsgt.simulation.mission.setup_mistakes import SetupMistake
@@ -28,6 +29,7 @@ __all__ = [
     "SetupMistake",
     "Slew",
     "StationLog",
+    "StationMove",
     "ValidPoses",
     "has_odometry",
     "instrument_config",

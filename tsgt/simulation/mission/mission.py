@@ -7,6 +7,7 @@ at any instant, and then finds its journals, the channel and the instrument as i
 from __future__ import annotations
 
 import asyncio
+import math
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.config import SuperframeMasterConfig, scenario_parameters
+from tsgt.config import SuperframeMasterConfig, level_frame, scenario_parameters
 from tsgt.estimation import start_now
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
@@ -35,7 +36,13 @@ from tsgt.simulation.mission.daemon_configs import (
     station_name,
 )
 from tsgt.simulation.mission.poll_replies import observed
-from tsgt.simulation.mission.run_log import START_UNIX_NS, MasterLog, ObservedInstrument, StationLog
+from tsgt.simulation.mission.run_log import (
+    START_UNIX_NS,
+    MasterLog,
+    ObservedInstrument,
+    StationLog,
+    StationMove,
+)
 from tsgt.simulation.mission.setup_mistakes import NO_MISTAKE, SetupMistake
 from tsgt.simulation.wheel_odometry import OdometryModel, OdometryProgram, simulate_odometry
 from tsgt.simulation.world import is_shaken, scenario_world
@@ -50,7 +57,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.kernel import Timeline
     from tsgt.simulation.options import Outage, SimulationOptions
     from tsgt.simulation.wheel_odometry import OdometryCondition, OdometrySamples
-    from tsgt.simulation.world import World
+    from tsgt.simulation.world import Rollover, World
     from tsgt.station import Reading
 
 DRAIN_S = 5.0
@@ -99,7 +106,7 @@ class _ClientClock:
 class Mission:
     """A mission; create and use it in a running event loop on virtual time. Dictionaries are keyed by station number.
 
-    ``imu_conditions``, ``odometry_conditions``: faults of the robot's IMU and wheel odometry.
+    ``imu_conditions``, ``odometry_conditions``: faults of the robot's IMU and wheel odometry; ``rollovers``: of the robot.
     """
 
     def __init__(
@@ -111,6 +118,7 @@ class Mission:
         timeline: Timeline,
         imu_conditions: Sequence[ImuCondition] = (),
         odometry_conditions: Sequence[OdometryCondition] = (),
+        rollovers: Sequence[Rollover] = (),
     ) -> None:
         rng = np.random.default_rng(options.seed)
         world_rng, air_rng, master_rng, clock_rng, *station_rngs = rng.spawn(4 + len(scenario.stations))
@@ -132,6 +140,8 @@ class Mission:
         self.parameters = scenario_parameters(scenario)
         until_s = options.duration_s + 2 * DRAIN_S
         self.world: World = scenario_world(scenario, until_s, world_rng)  # ground truth on true time
+        if rollovers:
+            self.world.roll_over(rollovers, numbers)
         # Generators of their own: with shaking and IMU all other draws stay the same.
         if is_shaken(scenario):
             shaking_rng = np.random.default_rng([options.seed, _SHAKING_SEED])
@@ -157,6 +167,7 @@ class Mission:
                 conditions=odometry_conditions,
             )
             self.parameters = replace(self.parameters, odometry=wheels.parameters())
+        self.first_parameters = self.parameters
         self._positions_m = {station_name(s.station): s.position_m for s in scenario.stations}
         self._positions_m[INTERFERER] = _INTERFERER_POSITION_M
         self.air = Air(timeline, air_rng, scenario_link(scenario.radio, self._positions_m, air_rng))
@@ -174,6 +185,8 @@ class Mission:
         self.master_logs: list[MasterLog] = []  # one per start of the master
         self.other_master_logs: list[MasterLog] = []  # of masters that do not belong to the mission
         self.prisms = {s.station: s.prism for s in scenario.stations}
+        self._placed = {s.station: s for s in scenario.stations}  # where the stations are now
+        self.moves: list[StationMove] = []
         self.mistakes: dict[int, SetupMistake] = {}  # in force from the next start of the client on
         self.drifting: set[int] = set()  # stations whose clock drift is changing
         self.superframe = isinstance(options.protocol, SuperframeMasterConfig)
@@ -283,7 +296,7 @@ class Mission:
 
     def _new_master_log(self, folder: str, clock: VirtualClock) -> MasterLog:
         unix_at_zero_ns = clock.realtime_ns() - clock.monotonic_ns()
-        return MasterLog(self._folder / folder, self._true.monotonic_ns, unix_at_zero_ns)
+        return MasterLog(self._folder / folder, self._true.monotonic_ns, unix_at_zero_ns, self.parameters)
 
     def _master(
         self, master_log: MasterLog, computer: Computer, clock: VirtualClock
@@ -509,6 +522,24 @@ class Mission:
         self._boots[station] += 1
         computer.suspended_ns = 0
         self.start_station(station)
+
+    def move_station(self, station: int, shift_m: Sequence[float], turn_rad: float) -> None:
+        """Shift a station's levelled instrument along the axes of station 1's first frame and turn it about the vertical."""
+        entry = self._placed[station]
+        x, y, z = (float(at + by) for at, by in zip(entry.position_m, shift_m, strict=True))
+        update = {"position_m": (x, y, z), "yaw_deg": entry.yaw_deg + math.degrees(turn_rad)}
+        moved = self._placed[station] = entry.model_copy(update=update)
+        self.instruments[station].set_up_at(moved)
+        self.moves.append(StationMove(station, self.now_s, level_frame(moved)))
+
+    async def recalibrate(self) -> None:
+        """Restart the master with the stations' true frames."""
+        frames = {number: level_frame(entry) for number, entry in self._placed.items()}
+        stations = [
+            replace(each, T_station1_station=frames[each.station]) for each in self.parameters.stations
+        ]
+        self.parameters = replace(self.parameters, stations=tuple(stations))
+        await self.restart(None, self.now_s)
 
     def stream_socket(self) -> Path:
         """Return the stream socket of the current or last master."""

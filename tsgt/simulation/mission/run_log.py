@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.config import LeicaInstrumentConfig
-    from tsgt.model import Parameters
+    from tsgt.model import Matrix4, Parameters
     from tsgt.simulation.faults.catalogue import FaultKind
     from tsgt.simulation.imu import SimulatedImuRun
     from tsgt.simulation.instrument import ReportedDistance
     from tsgt.simulation.mission.poll_replies import PollReply
     from tsgt.simulation.options import Outage
     from tsgt.simulation.wheel_odometry import OdometrySamples as SimulatedOdometry
-    from tsgt.simulation.world import World
+    from tsgt.simulation.world import Rollover, World
     from tsgt.station import ClientStatus, Reading
     from tsgt.station.serial import OpenPort
 
@@ -103,6 +103,8 @@ class MasterLog:
         Returns the true time in ns from the start.
     unix_at_zero_ns
         The master's Unix clock at true time zero, in ns, as set when the master started.
+    parameters
+        The set-up that it was started with; None: that of the whole mission.
 
     Attributes
     ----------
@@ -114,8 +116,15 @@ class MasterLog:
         Number of frames from the first to the last beacon, and their total duration.
     """
 
-    def __init__(self, folder: Path, now_ns: Callable[[], int], unix_at_zero_ns: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        now_ns: Callable[[], int],
+        unix_at_zero_ns: int,
+        parameters: Parameters | None = None,
+    ) -> None:
         self.folder = folder
+        self.parameters = parameters
         self._now_ns = now_ns
         self.unix_at_zero_ns = unix_at_zero_ns
         self.crashed = False  # whether it was killed
@@ -387,6 +396,14 @@ class ObservedInstrument(LeicaInstrument):
         return reading
 
 
+class StationMove(NamedTuple):
+    """From an instant on, in s from the start, a station has another true frame."""
+
+    station: int
+    from_s: float
+    T_station1_station: Matrix4
+
+
 class Slew(NamedTuple):
     """NTP has changed the frequency of a station's clock for some time; times in s from the start."""
 
@@ -399,7 +416,7 @@ class Slew(NamedTuple):
 class MissionResult:
     """A completed mission."""
 
-    parameters: Parameters  # setup as known to the master: the exact truth
+    parameters: Parameters  # setup as known to the first master: the exact truth at the start
     world: World  # ground truth; times count from the start of the mission
     duration_s: float  # duration of the measurements, drain excluded
     master_logs: list[MasterLog]  # one per start of the master
@@ -409,6 +426,8 @@ class MissionResult:
     outages: tuple[Outage, ...] = ()
     faults: Counter[FaultKind] = field(default_factory=Counter)  # number of faults by kind
     slews: tuple[Slew, ...] = ()  # of the stations' clocks by NTP
+    moves: tuple[StationMove, ...] = ()  # of the stations, in their order
+    rollovers: tuple[Rollover, ...] = ()  # of the robot
     knocks_s: tuple[float, ...] = ()  # when the IMU was knocked, in s from the start
     faults_end_s: float | None = None  # end of the faults in s from the start; None: no faults
     rate_hz: dict[int, float] = field(default_factory=dict)  # measurement rate by station number

@@ -60,9 +60,14 @@ def _drive(*, late_s: float = 0.0, stamp_error_s: float = 0.0, stated: float = 1
         unix_at_zero_ns=START,
         measurements=measured,
         trackers=set(),
+        parameters=None,
     )
     result = SimpleNamespace(
-        parameters=PARAMETERS, true_poses=_pose_at, world=SimpleNamespace(pose_at=_pose_at)
+        parameters=PARAMETERS,
+        true_poses=_pose_at,
+        world=SimpleNamespace(pose_at=_pose_at),
+        moves=(),
+        rollovers=(),
     )
     reported = [
         SimpleNamespace(

@@ -63,7 +63,7 @@ def test_setup_with_another_frame_is_detected() -> None:
     wrong = replace(setup, stations=(moved, *setup.stations[1:]))
     result: Any = SimpleNamespace(parameters=PARAMETERS)
     for each, count in ((setup, 0), (wrong, 1)):
-        log: Any = SimpleNamespace(setups=[each])
+        log: Any = SimpleNamespace(setups=[each], parameters=None)
         assert len(list(setup_failures(log, result))) == count
 
 

@@ -126,6 +126,12 @@ async def silent_station(mission: Mission) -> None:
         mission.air.link.set_attenuation(MASTER, station_name(2), attenuation_db)
 
 
+async def turned_tripod(mission: Mission) -> None:
+    """Turn the tripod of station 2 by 2 mrad."""
+    await mission.sleep_until(15.0)
+    mission.move_station(2, (0.0, 0.0, 0.0), 0.002)
+
+
 async def sleeping_reader(mission: Mission) -> None:
     """Connect to the stream and read nothing, to the end."""
     await mission.sleep_until(2.0)
@@ -263,6 +269,9 @@ DEFECTS: Final = {
     ),
     "lost-event": Defect(
         "a lost station is no event", defects_published.report_no_lost_station, script=silent_station
+    ),
+    "layout-event": Defect(
+        "a tripod that was turned is no event", defects_published.report_no_layout, script=turned_tripod
     ),
     "outstanding": Defect(
         "nothing is outstanding by the status",

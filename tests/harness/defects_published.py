@@ -14,6 +14,7 @@ import numpy as np
 from tsgt.estimation import observations, pose_output, tracks
 from tsgt.estimation.pose_batch import PoseBatch
 from tsgt.master.classic import ingest
+from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.master.recording_thread import RecordingThread
 from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
@@ -201,6 +202,11 @@ def report_no_lost_station(planting: Planting) -> None:
         "tick",
         lambda _: lambda _detector, _now_ns, *, realtime_ns: [],  # noqa: ARG005
     )
+
+
+def report_no_layout(planting: Planting) -> None:
+    """Publish no event of prisms that miss their layout."""
+    planting.replace_attribute(LayoutMonitor, "pose", lambda _: lambda _monitor, _record, _now_ns: [])
 
 
 def state_nothing_outstanding(planting: Planting) -> None:

@@ -72,6 +72,14 @@ each would be below so many of these limits.
 MIN_OVERLAP_SHARE = 0.6
 """Of the shorter series, as far as it is known, which the other one must overlap at the stamps and at any latency that is tried."""
 
+FAST_RADPS = 1.0
+"""Single turns that are faster are not compared: prisms that are measured twice a second do not tell them, and a robot that rolls
+over hides its prisms.
+"""
+
+FAST_MARGIN_S = 1.0  # Before and after them: the trajectory of the stations is bent there
+MAX_FAST_SHARE = 0.2  # Of a drive; above it the unit is wrong, or the robot turns like this
+
 MIN_SHARED_S = 7.0  # In which both are known: a share of the shortest drive that is checked
 MIN_MEASUREMENTS = 60
 MIN_EXTENT_M = 0.05  # Between prisms that tell a rotation
@@ -137,7 +145,7 @@ def check_imu_setup(
     """
     if not len(samples):
         return SetupCheck()
-    robot, imu = series_of_trajectory(trajectory, gravity), series_of_samples(samples)
+    robot, imu = series_of_trajectory(trajectory, gravity), _without_fast_turns(series_of_samples(samples))
     shorter_s = GRID_S * min(np.count_nonzero(each.known) for each in (robot, imu))
     ours, theirs = overlap_at(robot, imu, 0.0)
     if GRID_S * len(ours) < max(MIN_SHARED_S, MIN_OVERLAP_SHARE * shorter_s):
@@ -189,6 +197,16 @@ class _Start(NamedTuple):
     rotation: FloatArray
     latency_s: float
     gyro_bias: FloatArray
+
+
+def _without_fast_turns(imu: Series) -> Series:
+    """Return rates and forces that are unknown around single fast turns."""
+    fast = np.linalg.norm(imu.rate, axis=1) > FAST_RADPS
+    margin = round(FAST_MARGIN_S / GRID_S)
+    near = np.convolve(fast, np.ones(2 * margin + 1))[margin : margin + len(fast)] > 0.5
+    if np.count_nonzero(near & imu.known) > MAX_FAST_SHARE * np.count_nonzero(imu.known):
+        return imu
+    return replace(imu, known=imu.known & ~near)
 
 
 def _wrong_units(robot: Series, imu: Series, gravity: Gravity) -> list[SetupFinding]:

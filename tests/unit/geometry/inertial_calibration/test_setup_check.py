@@ -13,7 +13,7 @@ from harness.imu_calibration import uncalibrated_drive
 from tsgt.geometry import exp_so3
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding, check_imu_setup
-from tsgt.geometry.inertial_calibration.setup_check import certain_bound
+from tsgt.geometry.inertial_calibration.setup_check import GROSS, certain_bound
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -188,6 +188,24 @@ def test_one_prism_alone_is_not_another_robot() -> None:
     check = drive(alone_from_s=42.0).check()
     assert check.findings == ()
     assert check.confirmed
+
+
+def test_robot_that_rolls_over_has_the_same_imu() -> None:
+    """Its prisms are hidden as soon as it has rolled by 45 degrees, and seen again when it stands: they do not tell the fast turn."""
+    sound = drive()
+    lying = (sound.observations.time_s > 25.7) & (sound.observations.time_s < 31.8)
+    fit = fit_trajectory(sound.observations.select(~lying))
+    rates = sound.samples.angular_rate_radps.copy()
+    for from_s, sign in ((25.0, 1.0), (31.0, -1.0)):
+        progress = np.clip((sound.samples.end_s - from_s) / 1.5, 0.0, 1.0)
+        rates[:, 0] += sign * np.radians(110.0) / 1.5 * 30.0 * progress**2 * (1.0 - progress) ** 2
+    rolled = replace(
+        sound,
+        observations=fit.observations,
+        trajectory=fit.trajectory,
+        samples=replace(sound.samples, angular_rate_radps=rates),
+    )
+    assert not {finding.cause for finding in rolled.check().findings} & GROSS
 
 
 @pytest.mark.slow

@@ -204,7 +204,7 @@ def test_outstanding_measurements_are_counted(tmp_path: Path, stated: int, count
     log.arrived_ns = [0] * 5
     station_log = SimpleNamespace(read_times_ns=dict.fromkeys(range(15), 0) | {15: 10**12})
     result: Any = SimpleNamespace(
-        faults_end_s=None, superframe=True, master_logs=[log], station_logs={1: station_log}
+        faults_end_s=None, moves=(), superframe=True, master_logs=[log], station_logs={1: station_log}
     )
     assert len(list(outstanding_failures(result))) == count
 
@@ -337,7 +337,7 @@ def test_poses_that_the_measurements_allow(tmp_path: Path, valid: int, count: in
     ]
     poses = [replace(POSE, valid=number < valid, reason="") for number in range(140)]
     log = _log(tmp_path, *measured, *poses)
-    result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, master_logs=[log])
+    result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, moves=(), master_logs=[log])
     assert len(list(missing_poses(result))) == count
     result.faults_end_s = 180.0
     assert not list(missing_poses(result))
@@ -351,7 +351,7 @@ def test_no_poses_are_expected_of_a_backlog(tmp_path: Path) -> None:
         for number in (1, 2, 3)
     ]
     log = _log(tmp_path, *measured, replace(POSE, valid=False, reason="outage"))
-    result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, master_logs=[log])
+    result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, moves=(), master_logs=[log])
     assert not list(missing_poses(result))
 
 

@@ -59,6 +59,23 @@ def test_outliers_have_small_weights(observations: Observations) -> None:
     assert np.count_nonzero(found.weights < 0.5) == len(spoilt)
 
 
+def test_blunders_at_the_end_are_rejected_as_by_a_close_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three of the last four measurements are 0.15 to 0.35 m off, where little contradicts them."""
+    motion = draw_motions(PRIOR, count=1, duration_s=41.0, seed=21)[0]
+    measured = sorted_by_time(measure(motion, until_s=40.0, seed=22))
+    points = measured.points_m.copy()
+    points[-4:-2] += [[0.12, -0.1, 0.05], [-0.1, 0.12, 0.05]]
+    points[-1] += 0.2
+    spoilt = replace(measured, points_m=points)
+    found = fit_trajectory(spoilt, prior=PRIOR, noise_scale=1.0).trajectory
+    monkeypatch.setattr(fitting, "INITIAL_GAIN_PER_KNOT", 0.0)
+    monkeypatch.setattr(fitting, "FINAL_GAIN_PER_KNOT", 0.0)
+    close = fit_trajectory(spoilt, prior=PRIOR, noise_scale=1.0).trajectory
+    sigma = np.sqrt(np.diagonal(close.covariance, axis1=1, axis2=2))
+    error = found.knots.local_coordinates_about(close.knots) / sigma
+    assert np.abs(error[:, :6]).max() < 0.05
+
+
 @pytest.mark.slow
 def test_prism_missing_for_a_minute(observations: Observations) -> None:
     """Without one prism the covariance is larger."""

@@ -56,9 +56,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
     from tsgt.geometry.trajectory.states import States
 
-KNOTS_PER_SEGMENT = (
-    1536  # Three and a half minutes of 3 stations at 2.5 Hz; overlaps add an eighth to the work
-)
+KNOTS_PER_SEGMENT = 1536  # 200 s of 3 stations at 2.5 Hz: the overlaps add an eighth to the work
 MAX_ADAPTED_ITERATIONS = (
     6  # From the solution before the last adaptation, which is close; two or three suffice
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from tsgt.errors import GeometryError
 
@@ -23,8 +24,6 @@ _LEAST_INFORMATION = 1e-9  # Relative to that on the best determined combination
 _NEAR = 5.0
 _SECANTS, _MIN_CURVATURE = 3, 0.2
 _GOOD, _POOR = 0.5, 0.1  # Of the predicted gain
-_MAX_ACTIVE_SETS = 200  # A handful suffices
-_SLOPE_TOLERANCE = 1e-10  # Relative to the largest gradient; smaller slopes at a bound are rounding
 
 
 class Curved(NamedTuple):
@@ -88,45 +87,9 @@ def newton_step(here: Curved, lowest: FloatArray, highest: FloatArray) -> FloatA
     free = highest > lowest
     values, vectors = np.linalg.eigh(here.information[np.ix_(free, free)])
     # Where the data say nothing about a combination of parameters, the bounds limit it.
-    information = (vectors * np.maximum(values, _LEAST_INFORMATION * values[-1])) @ vectors.T
-    step[free] = _bounded_maximum(here.gradient[free], information, lowest[free], highest[free])
+    roots = np.sqrt(np.maximum(values, _LEAST_INFORMATION * values[-1]))
+    towards = vectors.T @ here.gradient[free] / roots
+    step[free] = lsq_linear(
+        roots[:, None] * vectors.T, towards, (lowest[free], highest[free]), method="bvls"
+    ).x
     return step
-
-
-def _bounded_maximum(
-    gradient: FloatArray, information: FloatArray, lowest: FloatArray, highest: FloatArray
-) -> FloatArray:
-    """(P,) maximum of ``gradient @ x - x @ information @ x / 2`` within bounds, by active sets.
-
-    P. B. Stark and R. L. Parker, "Bounded-variable least-squares: an algorithm and applications", Computational Statistics
-    10, 1995. ``information``: positive definite.
-    """
-    x: FloatArray = np.clip(0.0, lowest, highest)
-    at_bound = (x == lowest) | (x == highest)
-    for _ in range(_MAX_ACTIVE_SETS):
-        inside = ~at_bound
-        # Move to the maximum of the free parameters, up to the first bound on the way.
-        while inside.any():
-            slope = (gradient - information @ x)[inside]
-            towards = np.linalg.solve(information[np.ix_(inside, inside)], slope)
-            bound = np.where(towards > 0, highest[inside], lowest[inside])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                shares = np.where(towards != 0, (bound - x[inside]) / towards, np.inf)
-            first = int(np.argmin(shares))
-            rows = np.flatnonzero(inside)
-            if shares[first] >= 1.0:
-                x[rows] += towards
-                break
-            x[rows] += shares[first] * towards
-            x[rows[first]] = bound[first]
-            inside[rows[first]] = False
-        at_bound = ~inside
-        # Free the parameter whose bound the function rises from most steeply.
-        slope = gradient - information @ x
-        inwards = np.where(x == lowest, slope, -slope)
-        inwards[inside] = 0.0
-        worst = int(np.argmax(inwards))
-        if inwards[worst] <= _SLOPE_TOLERANCE * (np.abs(gradient).max() + 1.0):
-            break
-        at_bound[worst] = False
-    return x

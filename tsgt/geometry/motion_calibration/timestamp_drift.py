@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -86,29 +87,10 @@ def estimate_wander_s(
         log_likelihood += 0.5 * float(gradient @ np.linalg.solve(information, gradient))
         return -float(log_likelihood - 0.5 * np.linalg.slogdet(information)[1])
 
-    lowest = float(np.log(MIN_WANDER_S))
-    log_wander, value = _minimum(negative, lowest, float(np.log(MAX_WANDER_S)), tolerance=1e-3)
+    bounds = (float(np.log(MIN_WANDER_S)), float(np.log(MAX_WANDER_S)))
+    found = minimize_scalar(negative, bounds=bounds, method="bounded", options={"xatol": 0.01})
     # Without evidence the search stops just short of the lower bound.
-    return float(np.exp(log_wander)) if value < negative(lowest) - 1e-6 else 0.0
-
-
-def _minimum(
-    function: Callable[[float], float], lower: float, upper: float, *, tolerance: float
-) -> tuple[float, float]:
-    """Find where a function with one minimum between bounds has it, and its value there, by golden sections."""
-    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
-    left, right = upper - ratio * (upper - lower), lower + ratio * (upper - lower)
-    at_left, at_right = function(left), function(right)
-    while upper - lower > tolerance:
-        if at_left < at_right:
-            upper, right, at_right = right, left, at_left
-            left = upper - ratio * (upper - lower)
-            at_left = function(left)
-        else:
-            lower, left, at_left = left, right, at_right
-            right = lower + ratio * (upper - lower)
-            at_right = function(right)
-    return (left, at_left) if at_left < at_right else (right, at_right)
+    return float(np.exp(found.x)) if found.fun < negative(bounds[0]) - 1e-6 else 0.0
 
 
 def birge_ratio(segments: Sequence[SegmentInformation], factor: FloatArray) -> float:

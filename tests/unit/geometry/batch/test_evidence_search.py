@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.batch.evidence_search import Curved, maximise, newton_step
+from tsgt.geometry.batch.evidence_search import Curved, maximise
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
@@ -43,26 +43,6 @@ def test_finds_the_maximum_within_bounds(limit: float) -> None:
     found, value = maximise(log_evidence_of_variances, start, lower, upper)
     assert value == pytest.approx(-expected.fun, abs=0.01)
     np.testing.assert_allclose(found, expected.x, atol=0.02)
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_newton_step_is_the_maximum_within_bounds(seed: int) -> None:
-    """The slope is zero within the bounds, and points outwards at them; a parameter without room keeps its bound."""
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(12, 12)) * 10.0 ** rng.uniform(-1, 1, 12)
-    information, gradient = root.T @ root, rng.normal(size=12)
-    lowest, highest = -(10.0 ** rng.uniform(-3, 1, 12)), 10.0 ** rng.uniform(-3, 1, 12)
-    lowest[:2], highest[:2] = 0.1, (0.1, 0.3)
-    step = newton_step(Curved(0.0, gradient, information), lowest, highest)
-    assert step[0] == 0.1
-    assert ((step >= lowest) & (step <= highest)).all()
-    # The parameter without room does not enter the equations of the others.
-    slope = gradient[1:] - information[1:, 1:] @ step[1:]
-    at_lowest, at_highest = step[1:] == lowest[1:], step[1:] == highest[1:]
-    assert at_lowest.any() or at_highest.any()
-    np.testing.assert_allclose(slope[~at_lowest & ~at_highest], 0.0, atol=1e-8)
-    assert (slope[at_lowest] <= 1e-8).all()
-    assert (slope[at_highest] >= -1e-8).all()
 
 
 def test_avoids_points_without_a_solution() -> None:

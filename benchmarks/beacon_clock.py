@@ -1,7 +1,7 @@
 """What a station makes of the beacons' times: errors and bounds in all scenarios, and what the fit costs.
 
 Errors are those of the times as they go over the air, in steps of 16 us; see docs/explanation/superframe-clock.md.
-``--json`` prints the same figures in us.
+``--json`` prints the same figures in us. ``--early-delays``: some of a session's first beacons share a delay.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import copy
 import json
+import math
 import statistics
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -18,10 +19,18 @@ import numpy as np
 from harness.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
 from measuring import best_s
 
+from tsgt.radio.superframe import SESSION_INTERVAL
+from tsgt.radio.superframe.master import SESSION_INTERVAL_JOINING
+from tsgt.radio.superframe.station_state import FULL_TIME_FRAMES
 from tsgt.timesync import BeaconClock
 
 if TYPE_CHECKING:
     from harness.beacon_scenarios import BeaconScenario, ReportedTime
+
+EARLY = 12
+"""Some of so many first beacons share a delay, drawn between these two."""
+EARLY_DELAYS_US = (1000.0, 6500.0)
+EARLY_RUNS = 200
 
 SETTLED_S = 5.0
 """Live figures are of what is measured after this."""
@@ -51,7 +60,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Time errors of the fit of beacons, over many seeds.")
     parser.add_argument("--json", action="store_true", help="figures for a machine")
     parser.add_argument("--seeds", type=int, default=50, help="how many runs of each scenario (default 50)")
+    parser.add_argument("--early-delays", action="store_true", help="only delays among the first beacons")
     arguments = parser.parse_args()
+    if arguments.early_delays:
+        early_delays()
+        return
     rows = [row(scenario, arguments.seeds) for scenario in BEACON_SCENARIOS]
     if arguments.json:
         print(json.dumps({"rows": [asdict(r) for r in rows], "cost_us": cost_us()}, indent=1))
@@ -69,6 +82,46 @@ def main() -> None:
     print()
     for call, figure in cost_us().items():
         print(f"{call}: {figure:.0f} us")
+
+
+def early_delays() -> None:
+    """Print a row for each number of delayed beacons."""
+    print("| delayed | runs | outside | furthest outside, us | bound after 16 s, p50, us |")
+    print("|---|---|---|---|---|")
+    for count in range(6):
+        found = [early_delay(count, seed) for seed in range(EARLY_RUNS)]
+        beyond_us, bounds_us = np.array(found).T
+        largest_us = max(float(beyond_us.max()), 0.0)
+        outside = np.count_nonzero(beyond_us > 0)
+        print(
+            f"| {count} | {EARLY_RUNS} | {outside} | {largest_us:.0f} | {np.median(bounds_us):.0f} |",
+            flush=True,
+        )
+
+
+def early_delay(count: int, seed: int) -> tuple[float, float]:
+    """Run 16 s of a session; return by how much a time exceeded its bound, and the last bound, in us."""
+    rng = np.random.default_rng([count, seed])
+    jitter_us, skew = float(rng.choice([3.0, 20.0])), 1 + float(rng.uniform(-50, 50)) / 1e6
+    late_us = np.zeros(40)
+    late_us[rng.choice(EARLY, count, replace=False)] = rng.uniform(*EARLY_DELAYS_US)
+    clock, beyond_us, bound_us = BeaconClock(), -math.inf, math.nan
+    for frame, delay_us in enumerate(late_us.tolist()):
+        true_us = 7000 + FRAME_NS // 1000 * frame
+        received_ns = 10**12 + round(1000 * (skew * true_us + delay_us + rng.normal(0.0, jitter_us)))
+        sent_us = round(true_us + rng.normal(0.0, jitter_us))
+        every = SESSION_INTERVAL if clock.initialised else SESSION_INTERVAL_JOINING
+        unambiguous = frame < FULL_TIME_FRAMES or frame % every == 0
+        full_us = sent_us if unambiguous else clock.unwrap(received_ns, sent_us & 0xFFFF)
+        if full_us is not None:
+            clock.add(received_ns, full_us, round(1000 * jitter_us), unambiguous=unambiguous)
+        for before_s in (-0.2, 0.3, 1.0, 2.0, 4.0, 8.0, 20.0) if clock.converged else ():
+            asked_us = true_us - 1e6 * before_s
+            found = clock.at(10**12 + round(1000 * skew * asked_us))
+            assert found is not None  # noqa: S101 (converged)
+            bound_us = found.bound_us if before_s < 0 else bound_us
+            beyond_us = max(beyond_us, abs(found.time_us - asked_us) - found.bound_us)
+    return beyond_us, bound_us
 
 
 def row(scenario: BeaconScenario, seeds: int) -> Row:

@@ -59,6 +59,14 @@ class TimeEstimate(NamedTuple):
     bound_us: float
 
 
+class _EarlySample(NamedTuple):
+    """A sample from before the jitter was known."""
+
+    sample: BeaconSample
+    unambiguous: bool
+    live: bool
+
+
 class _Jitter:
     """Scale of the scatter over the claimed sigma: a running mean square with a prior and exponential forgetting."""
 
@@ -120,6 +128,7 @@ class BeaconClock:
 
     def __init__(self) -> None:
         self._jitter = _Jitter()
+        self._early: deque[_EarlySample] = deque(maxlen=MAX_SAMPLES)
         self._segments: list[ClockSegment] = []
         self._initial_live = False
         self.initialised = False
@@ -180,21 +189,45 @@ class BeaconClock:
         sample = BeaconSample(received_ns, sent_ns, sigma_ns, self._jitter.variance_us2(sigma_ns))
         if not self.initialised:
             return unambiguous and self._initialise(sample, live=live)
-        segment = self._segments[-1]
-        consistent, jitter_unknown = segment.is_consistent(sample), not self._jitter.known
+        jitter_unknown = not self._jitter.known
+        consistent = self._segments[-1].is_consistent(sample)
         if consistent or self._candidate is not None:
             self._jitter.add(sample)  # a single outlier says nothing about the jitter of the others
-        if not consistent:
+        if jitter_unknown:
+            self._early.append(_EarlySample(sample, unambiguous or consistent, live))
+            if self._jitter.known:
+                return self._refit()
+        return self._fit(sample, unambiguous=unambiguous, live=live)
+
+    def _fit(self, sample: BeaconSample, *, unambiguous: bool, live: bool) -> bool:
+        """Take a sample after initialisation; return False if rejected."""
+        segment = self._segments[-1]
+        if not segment.is_consistent(sample):
             self._add_to_candidate(sample, segment, unambiguous=unambiguous, live=live)
             return abs(segment.innovation_us(sample)) <= MAX_DEVIATION_US
         if self._must_wait(sample, segment, live=live):
             return True
         segment.add(sample)
-        if jitter_unknown and self._jitter.known:
-            self._segments[-1] = segment.reweighted(self._jitter.variance_us2)
         self._candidate = None
         self._limit_samples()
         return True
+
+    def _refit(self) -> bool:
+        """Take all samples anew with the jitter that is now known; return False if the newest is rejected.
+
+        Some of them may share a delay that the coarse variances accepted.
+        """
+        early = list(self._early)
+        self._early.clear()
+        self._segments, self._candidate, self.initialised = [], None, False
+        accepted = False
+        for sample, unambiguous, live in early:
+            weighted = sample._replace(variance_us2=self._jitter.variance_us2(sample.sigma_ns))
+            if self.initialised:
+                accepted = self._fit(weighted, unambiguous=unambiguous, live=live)
+            else:
+                accepted = unambiguous and self._add_initial(weighted, live=live)
+        return accepted
 
     def unwrap(self, received_ns: int, low16: int) -> int | None:
         """Return the full session time in us of a beacon, from its 16 low bits; None where it is ambiguous."""
@@ -262,14 +295,21 @@ class BeaconClock:
 
     def _initialise(self, sample: BeaconSample, *, live: bool) -> bool:
         """Take an unambiguous sample before initialisation; return whether it agrees with those before it."""
+        if self._segments and not self._segments[0].is_consistent(sample):
+            self._jitter = _Jitter()
+            self._early.clear()
+        self._jitter.add(sample)
+        self._early.append(_EarlySample(sample, unambiguous=True, live=live))
+        return self._add_initial(sample, live=live)
+
+    def _add_initial(self, sample: BeaconSample, *, live: bool) -> bool:
+        """Add a sample to the first segment, or start it with this one where they disagree."""
         first = not self._segments
         consistent = not first and self._segments[0].is_consistent(sample)
         if consistent:
             self._segments[0].add(sample)
         else:
-            self._jitter = _Jitter()
             self._segments, self._initial_live = [ClockSegment(sample, 0.0, _SKEW_SIGMA_PPM)], False
-        self._jitter.add(sample)
         self._initial_live = self._initial_live or live
         self.initialised = self._initial_live and len(self._segments[0]) >= _MIN_INITIAL_SAMPLES
         return consistent or first

@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from tsgt.timesync.clock_line import ClockLine
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 _SLOW_WALK_PPM2_PER_S = 0.006
 """Skew random walk of the slow filter, 0.6 ppm in a minute: with a sample every 0.4 s it averages over 20 to 30 s."""
@@ -102,7 +99,7 @@ class ClockSegment:
 
     def __init__(self, sample: BeaconSample, skew_ppm: float, skew_sigma_ppm: float) -> None:
         self.base_ns = sample.sent_ns - sample.received_ns
-        self._prior = skew_ppm, skew_sigma_ppm
+        self._skew_sigma_ppm = skew_sigma_ppm
         start = ClockLine(0.0, skew_ppm, sample.variance_us2, 0.0, skew_sigma_ppm**2)
         self._samples = [sample]
         self._received_ns = [sample.received_ns]
@@ -154,16 +151,6 @@ class ClockSegment:
         for sample in other._samples:
             self.add(sample)
 
-    def reweighted(self, variance_us2: Callable[[int], float]) -> ClockSegment:
-        """Return a fit of the same samples with other variances, given for each ``sigma_ns``."""
-        first, *others = (
-            sample._replace(variance_us2=variance_us2(sample.sigma_ns)) for sample in self._samples
-        )
-        segment = ClockSegment(first, *self._prior)
-        for sample in others:
-            segment.add(sample)
-        return segment
-
     def drop_oldest(self, count: int) -> None:
         """Remove the oldest samples; their information about later times stays."""
         del self._samples[:count], self._received_ns[:count], self._forward[:count]
@@ -203,7 +190,7 @@ class ClockSegment:
                 skew_ppm,
                 samples[start].variance_us2,
                 0.0,
-                self._prior[1] ** 2,
+                self._skew_sigma_ppm**2,
             )
             self._backward = {start: DualEstimate(line, line)}
             self._backward_first = self._backward_last = start

@@ -205,6 +205,21 @@ def test_bound_holds_before_outvoted_first_samples() -> None:
             assert abs(at.time_us - early_us) <= at.bound_us
 
 
+@pytest.mark.parametrize("delayed", [(9,), (9, 11), (8, 9), (0, 6, 10), (0, 1, 5, 10)])
+@pytest.mark.parametrize("late_us", [3_000, 5_000, 6_500])
+def test_bound_holds_with_equally_delayed_early_samples(late_us: int, delayed: tuple[int, ...]) -> None:
+    """Up to four before the jitter is known: it then shows that they do not belong to the others."""
+    clock = BeaconClock()
+    for k in range(40):
+        late_ns = 1000 * late_us if k in delayed else 0
+        clock.add(received_ns(sent_us(k)) + late_ns, sent_us(k), SIGMA_NS, unambiguous=True)
+        if clock.converged:
+            for back_us in (0, 500_000, 2_000_000, 8_000_000, 20_000_000):
+                at = clock.at(received_ns(sent_us(k) - back_us))
+                assert at is not None
+                assert abs(at.time_us - sent_us(k) + back_us) <= at.bound_us
+
+
 def test_slewed_clock_is_followed_within_seconds() -> None:
     """NTP slews the clock by 500 ppm: some samples are rejected, then the new skew is known; the bound always holds."""
     clock = clock_with(150)

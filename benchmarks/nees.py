@@ -7,7 +7,7 @@ are not independent, so that each has its own band.
 latencies, instrument errors, prisms, all correlated): with the full covariance and without the part that all poses of a run
 share; and differences between two poses of a run, with the random part alone.
 
-    python benchmarks/run.py nees [ROBOTS]
+    python benchmarks/run.py nees [ROBOTS [SEED]]
     python benchmarks/run.py nees set-up [RUNS]
 """
 
@@ -55,8 +55,8 @@ def band(freedom: int, count: int) -> tuple[float, float]:
     return low, high
 
 
-def known_set_up(robots: int) -> None:
-    """Print one table each for smoothed poses, predicted poses, and poses from one prism."""
+def known_set_up(robots: int, seed: int) -> None:
+    """Print one table each for smoothed poses, predicted poses, and poses from one prism; each seed draws other robots."""
     prior = MotionPrior()
     tables: dict[str, tuple[str, np.ndarray]] = {
         "smoothed": ("at s", INSIDE_S),
@@ -65,8 +65,8 @@ def known_set_up(robots: int) -> None:
     }
     found: dict[tuple[str, str], list[np.ndarray]] = {}
     start_s = time.process_time()
-    for number, motion in enumerate(draw_motions(prior, count=robots, duration_s=UNTIL_S + 2.5, seed=1)):
-        whole = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=number))
+    for number, motion in enumerate(draw_motions(prior, count=robots, duration_s=UNTIL_S + 2.5, seed=seed)):
+        whole = sorted_by_time(measure(motion, until_s=UNTIL_S, seed=number + robots * (seed - 1)))
         away = (whole.time_s > ONE_PRISM_S[0]) & (whole.time_s < ONE_PRISM_S[1]) & (whole.prism != 0)
         for name, (_, instants_s) in tables.items():
             observations = whole.select(~away) if name.startswith("one") else whole
@@ -234,4 +234,5 @@ def main() -> None:
     if sys.argv[1:2] == ["set-up"]:
         uncertain_set_up(int(sys.argv[2]) if len(sys.argv) > 2 else SETUP_RUNS)
     else:
-        known_set_up(int(sys.argv[1]) if len(sys.argv) > 1 else ROBOTS)
+        arguments = [int(each) for each in sys.argv[1:]]
+        known_set_up(*arguments, *(ROBOTS, 1)[len(arguments) :])

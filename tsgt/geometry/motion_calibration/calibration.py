@@ -34,6 +34,9 @@ MAX_ITERATIONS = 30
 STEP_TOLERANCE = 1e-3  # Squared length of a step, in sigmas of the set-up
 COARSE_NOISE_SCALES = (20.0, 4.0)  # First, so that a wrong set-up makes few outliers
 
+TRUNCATION_SIGMA_S = 1e-3 / np.sqrt(12)
+"""Of an instrument's times, which are whole milliseconds: each drive truncates another part of one, the same throughout."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionCalibration:
@@ -43,9 +46,7 @@ class MotionCalibration:
     setup: Setup
     # About the initial set-up, without its tilts if stations are levelled
     parameters: SetupParameters
-    covariance: (
-        FloatArray  # (G, G) of the parameters, scaled by ``birge_ratio`` squared; zero for what is fixed
-    )
+    covariance: FloatArray  # (G, G) of the parameters, scaled by ``birge_ratio`` squared; zero for what is fixed  # That of the latencies contains the truncation of times
     prior_sigmas: FloatArray  # (G,) of the prior, 0 for what is fixed
     # How much more the segments of the recording disagree than noise and timestamp drift explain, at least 1: a
     # sinking tripod
@@ -124,12 +125,17 @@ def calibrate_motion(
         setup, found = _search(segments, parameters, factor, setup, prior, wander_s=wander_s)
     ratio = birge_ratio(found.system.segments, factor)
     covariance = factor @ np.linalg.inv(found.information) @ factor.T
+    covariance = 0.5 * (covariance + covariance.T) * ratio**2
+    deviations = np.sqrt((factor**2).sum(axis=1))
+    estimated = parameters.latencies[deviations[parameters.latencies] > 0]
+    # Relative to station 1, whose own truncation shifts all others alike.
+    covariance[np.ix_(estimated, estimated)] += TRUNCATION_SIGMA_S**2 * (np.eye(len(estimated)) + 1.0)
     return MotionCalibration(
         initial,
         setup,
         parameters,
-        0.5 * (covariance + covariance.T) * ratio**2,
-        np.sqrt((factor**2).sum(axis=1)),
+        covariance,
+        deviations,
         ratio,
         wander_s,
         prior,

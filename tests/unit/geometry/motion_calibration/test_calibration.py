@@ -77,6 +77,21 @@ def test_frame_and_latency_errors_are_recovered() -> None:
 
 
 @pytest.mark.slow
+def test_latency_sigmas_contain_the_truncation_of_times() -> None:
+    """Times of station 2 are earlier by most of a millisecond throughout, those of station 3 later."""
+    observations = drive()
+    late_s = np.array([0.0, -8e-4, 2e-4])[observations.station]
+    shifted = replace(observations, time_s=observations.time_s + late_s)
+    order = np.argsort(shifted.time_s, kind="stable")
+    start = replace(TRUE, latencies_s=np.zeros(3))
+    found = calibrate_motion(shifted.select(order), REFINE, start=start, prior=MOTION_PRIOR, noise_scale=1.0)
+    error = found.parameters.local_coordinates(found.setup) - found.parameters.local_coordinates(start)
+    variances = np.diag(found.covariance)[found.parameters.latencies]
+    assert np.abs(error[found.parameters.latencies]).max() > 4e-4
+    assert (np.abs(error[found.parameters.latencies]) < 2.5 * np.sqrt(variances)).all()
+
+
+@pytest.mark.slow
 def test_covariance_is_consistent() -> None:
     """Over eight drives the mean of chi squared stays in its 99 % band."""
     distances = [calibration_error(with_errors(drive(60.0, seed=seed)), REFINE)[0] for seed in range(8)]

@@ -57,7 +57,8 @@ async def run(seed: int) -> tuple[int, int]:
 
 def main() -> None:
     """Print each run with a timestamp outside its bound, and their number."""
-    runs, first = (int(each) for each in (*sys.argv[1:], *(RUNS, 0)[len(sys.argv) - 1 :]))
+    chosen = [int(each) for each in sys.argv[1:]]
+    runs, first = [*chosen, *(RUNS, 0)[len(chosen) :]]
     times, outside = 0, 0
     for seed in range(first, first + runs):
         count, beyond_ns = run_virtual(partial(run, seed))

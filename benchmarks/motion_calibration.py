@@ -78,8 +78,12 @@ def drawn(length_s: float, seed: int, *, truncated: bool) -> Observations:
             zenith + noise[1] * across_m / distance_m,
             distance_m + noise[2] * along_m,
         )
-        late_s = -rng.uniform(0.0, 1e-3) if truncated else 0.0
-        late_s += 0.0 if truncated else rng.normal(scale=INSTRUMENT_TIME_SIGMA_S, size=len(time_s))
+        count = len(time_s)
+        late_s = (
+            np.full(count, -rng.uniform(0.0, 1e-3))
+            if truncated
+            else rng.normal(scale=INSTRUMENT_TIME_SIGMA_S, size=count)
+        )
         sigmas_m = np.column_stack([np.full(len(time_s), along_m), across_m, across_m])
         rows.append(np.column_stack([time_s + late_s, np.full(len(time_s), column), points_m, sigmas_m]))
     table = np.concatenate(rows)
@@ -103,7 +107,7 @@ def evaluate_drawn(
 ) -> tuple[float, FloatArray]:
     """Calibrate a drawn drive from a wrong set-up."""
     frames = observations.frames.copy()
-    frames[1] = planted(tuple(map(tuple, frames[1].tolist())), rng)
+    frames[1] = planted(cast("Matrix4", tuple(map(tuple, frames[1].tolist()))), rng)
     late_s = np.zeros(len(frames))
     late_s[1] = -LATE_S
     start = replace(Setup.of(observations), frames=frames, latencies_s=late_s)

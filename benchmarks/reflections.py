@@ -69,8 +69,8 @@ def live(motion: States, measured: Observations, row: int) -> dict[str, tuple[Fl
         smoother.marginalise_before(time_s[each] - LAG_S)
         if each < row or smoother.ambiguous:
             continue
-        for at_s in {float(time_s[each]), float(time_s[each] + time_s[each + 1]) / 2}:
-            rounded_s = np.array([np.ceil(at_s / STEP_S) * STEP_S])
+        for instant_s in {float(time_s[each]), float(time_s[each] + time_s[each + 1]) / 2}:
+            rounded_s = np.array([np.ceil(instant_s / STEP_S) * STEP_S])
             state, covariance = smoother.predict(float(rounded_s[0]), dim=6)
             predicted.append(judged("predicted", motion, rounded_s, state, covariance))
     first = np.ceil((time_s[row] - NEAR_S) / STEP_S)
@@ -100,10 +100,10 @@ def main() -> None:
             for name, measured in (("yes", wrong), ("no", right)):
                 for kind, each in live(motion, measured, row).items():
                     found.setdefault((kind, name), []).append(each)
-        for (kind, name), each in sorted(found.items()):
-            above = [sum(bool((squares > limit).any()) for squares, _ in each) for limit in SQUARES]
+        for (kind, name), drives in sorted(found.items()):
+            above = [sum(bool((squares > limit).any()) for squares, _ in drives) for limit in SQUARES]
             largest_m = max(
-                (float(e[s > SQUARES[0]].max()) for s, e in each if (s > SQUARES[0]).any()), default=0.0
+                (float(e[s > SQUARES[0]].max()) for s, e in drives if (s > SQUARES[0]).any()), default=0.0
             )
             print(
                 f"| {rate_hz:g} Hz | {kind} | {name} | {above[0]} | {above[1]} | {1e3 * largest_m:.0f} |",

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 MEMORY_CHECK_S = 60
-"""Interval of the memory checks."""
+"""Usual interval of the memory checks."""
 
 GARBAGE_THRESHOLD = 10_000
 """New objects, less those that are gone, after which the garbage collector looks for cycles."""
@@ -50,10 +50,12 @@ def simulate(
     folder: Path,
     progress: Callable[[float], None] = lambda now_s: None,  # noqa: ARG005 (default: not reported)
     script: Callable[[Mission], Coroutine[None, None, None]] | None = None,
+    memory_check_s: int = MEMORY_CHECK_S,
 ) -> MissionResult:
     """Simulate a mission on virtual time in an empty folder; the same scenario, options and script give the same result.
 
-    ``progress`` is called with the virtual time in s, every virtual second; ``script`` runs concurrently with the daemons.
+    ``progress`` is called with the virtual time in s, every virtual second; ``script`` runs concurrently with the daemons;
+    ``memory_check_s`` is the interval of the memory checks, each of which looks at all objects.
 
     Raises
     ------
@@ -102,7 +104,7 @@ def simulate(
             for second in range(1, math.ceil(options.duration_s) + 1):
                 await mission.run_until(min(second, options.duration_s))
                 progress(mission.now_s)
-                if second % MEMORY_CHECK_S == 0:
+                if second % memory_check_s == 0:
                     oversized.update(oversized_collections())
             airtime_s = mission.air.airtime_ns / 1e9
             await mission.run_until(options.duration_s + DRAIN_S)

@@ -6,7 +6,8 @@ Protocol, estimator, losses and drifts change from seed to seed, and with them h
 (`tsgt/simulation/faults/catalogue.py`); with an IMU the rate of the poses, their delays and
 which kinds come at all change too, and of several IMUs and numbers of stations each seed has one. A replay of the recording
 computes all poses a second time: whether it gives the same is checked in a quarter of the missions, drawn by seed, while
-`tsgt simulate` always checks it. A line for each violation says how to get the same run again. `make soak` runs it for a
+`tsgt simulate` always checks it. In a tenth of all missions a reader of the relay
+and the page follow the stream, and what they get is compared with it. A line for each violation says how to get the same run again. `make soak` runs it for a
 quarter of an hour. With `--json` the sums are kept, and a later call with the same file adds to them and goes on after
 the last seed.
 """
@@ -26,10 +27,12 @@ from collections import Counter
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from harness.passed_on import PassedOn
 from measuring import normalised_squared
 
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
@@ -52,6 +55,7 @@ if TYPE_CHECKING:
 
 DURATION_S = 220.0
 REPLAYED_SHARE = 0.25  # of the missions
+PASSED_ON_SHARE = 0.1  # likewise; the relay and the page wake up for every line
 STATIONS = 3
 LIMITS = (22.46, 38.26, 60.0)
 """What squared errors in sigmas, six degrees of freedom, exceed once in a thousand, in a million, in 2e10 honest poses."""
@@ -73,6 +77,7 @@ class Mission:
     faults: frozenset[FaultKind]  # kinds that may come
     replayed: bool = True  # whether a replay of the recording is checked
     odometry: bool = False  # whether the robot has wheels that are measured, beside the IMU
+    passed_on: bool = False  # whether a reader of the relay and the page follow the stream
 
     @classmethod
     def of(
@@ -100,6 +105,7 @@ class Mission:
             frozenset(FaultKind if imu == "none" else _some_kinds(rng)) - FIELD_DAY_FAULTS,
             bool(rng.random() < REPLAYED_SHARE),
             odometry,
+            bool(rng.random() < PASSED_ON_SHARE),
         )
 
     @property
@@ -111,7 +117,7 @@ class Mission:
     @property
     def command(self) -> str:
         """The command that runs it again."""
-        if self.imu != "none":
+        if self.imu != "none" or self.passed_on:
             wheels = "--odometry " if self.odometry else ""
             return (
                 f"python benchmarks/run.py soak --imu {self.imu} {wheels}--stations {self.stations} "
@@ -236,11 +242,22 @@ def run(seed: int, imu: ImuModelName = "none", stations: int = STATIONS, *, odom
         faults=mission.faults,
     )
     began_s = time.process_time()
+    passed_on = PassedOn()
     with _checked_once(), tempfile.TemporaryDirectory(prefix="tsgt-soak-") as folder:
+        Path(folder, "mission").mkdir()
         try:
-            done = simulate(scenario, options, folder=Path(folder))
+            done = simulate(
+                scenario,
+                options,
+                folder=Path(folder, "mission"),
+                script=partial(passed_on.follow, folder=Path(folder), until_s=DURATION_S)
+                if mission.passed_on
+                else None,
+            )
             violations = check_invariants(done, replay=mission.replayed)
             found = [f"{each.check}: {each.detail}" for each in violations]
+            if mission.passed_on:
+                found += (f"passed on: {what}" for what in passed_on.failures(done))
             _count(done, sums)
         except (KeyboardInterrupt, SystemExit):
             raise
@@ -271,7 +288,7 @@ def _count(done: MissionResult, sums: Sums) -> None:
             some = poses.select(poses.series == series)
             if not len(some.stamp_ns):
                 continue
-            truth = done.world.pose_at((some.stamp_ns - session.unix_at_zero_ns) / 1e9)
+            truth = done.in_force(session).true_poses((some.stamp_ns - session.unix_at_zero_ns) / 1e9)
             turned = rotation_from_quaternion(some.orientation_xyzw) @ np.swapaxes(truth[:, :3, :3], 1, 2)
             errors = np.concatenate([some.position_m - truth[:, :3, 3], log_so3(turned)], axis=1)
             nees = normalised_squared(errors, some.covariance)

@@ -94,6 +94,16 @@ class SuspensionWatch:
             raise ComputerSuspendedError(suspended_ns / 1e9)
 
 
+def first_suspension(errors: BaseExceptionGroup[ComputerSuspendedError]) -> ComputerSuspendedError:
+    """Return the first error of a group, which may contain groups."""
+    error: BaseException = errors
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    if not isinstance(error, ComputerSuspendedError):
+        raise TypeError(f"expected ComputerSuspendedError, got {error!r}")
+    return error
+
+
 @dataclass(frozen=True, slots=True)
 class UnixTimeline:
     """The mapping from CLOCK_MONOTONIC to Unix time, fixed from the start of a program to its end."""

@@ -23,7 +23,7 @@ from tsgt.config import (
     SuperframeMasterConfig,
 )
 from tsgt.errors import InstrumentError
-from tsgt.master.daemon import MasterDependencies, run_master
+from tsgt.master.daemon import MasterDependencies, run_through_suspensions
 from tsgt.model import Status
 from tsgt.radio import DirectCommand, SearchCommand, TrackCommand
 from tsgt.radio.classic import ClassicStation, MeasurementMessage, raw_status
@@ -385,9 +385,10 @@ class Field:
         start_imu: StartProgram | None = None,
         parameters: Parameters | None = None,
         read_setup: Callable[[], Parameters] | None = None,
+        suspended_ns: Callable[[], int] = lambda: 0,
     ) -> None:
         """Run the master until cancelled; published records are appended to :attr:`records`."""
-        await run_master(
+        await run_through_suspensions(
             config or self.config(),
             parameters or self.scene.parameters,
             PAPER,
@@ -398,6 +399,7 @@ class Field:
                 random_bits=lambda bits: int(self.rng.integers(1 << bits)),
                 start_imu=start_imu,
                 read_setup=read_setup,
+                suspended_ns=suspended_ns,
                 disk_status=lambda _folder: self.disk,
                 observe=lambda record, _line: self.records.append(record),
             ),

@@ -64,7 +64,7 @@ def master(config_path: Path) -> None:
     from tsgt.cli.composition import radio_key, radio_opener
     from tsgt.clock import SystemClock
     from tsgt.config import MasterConfig, check_permissions, load, parameters_in_force
-    from tsgt.master.daemon import MasterDependencies, run_master
+    from tsgt.master.daemon import MasterDependencies, run_through_suspensions
     from tsgt.master.reload import RELOAD_SIGNAL
     from tsgt.radio.from_config import lora_settings
     from tsgt.radio.legality import check_legality
@@ -85,7 +85,7 @@ def master(config_path: Path) -> None:
     clock = SystemClock()
     open_radio = radio_opener(config.radio, settings, clock)
     dependencies = MasterDependencies(open_radio=open_radio, clock=clock, key=key, read_setup=read_setup)
-    service.run(lambda: run_master(config, in_force, settings, dependencies))
+    service.run(lambda: run_through_suspensions(config, in_force, settings, dependencies))
 
 
 def main_client() -> NoReturn:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
@@ -17,9 +17,9 @@ import structlog
 
 import tsgt
 from tsgt import service
-from tsgt.clock import UnixTimeline
+from tsgt.clock import SuspensionWatch, UnixTimeline, first_suspension, suspended_ns
 from tsgt.config import ClassicMasterConfig
-from tsgt.errors import RadioError, StreamError
+from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError, StreamError
 from tsgt.imu import Imu, WheelOdometry
 from tsgt.master.alarms import Alarms
 from tsgt.master.classic import ClassicLink
@@ -94,15 +94,47 @@ class MasterDependencies:
     """Returns the space on the disk of a folder; called in a thread."""
     start_check: StartCheck | None = None
     """Starts a check of the IMU's set-up; None: in a thread of its own."""
+    suspended_ns: Callable[[], int] = suspended_ns
+    """Returns for how long the computer has been suspended since its start."""
+
+
+async def run_through_suspensions(
+    config: MasterConfig, parameters: Parameters, settings: LoRaSettings, dependencies: MasterDependencies
+) -> None:
+    """Run the master until cancelled. Raises as :func:`run_master`.
+
+    When the computer has been suspended, all begins anew, as after a restart: recording, session with the stations, timeline.
+    """
+    suspended: ComputerSuspendedError | None = None
+    while True:
+        try:
+            await run_master(config, parameters, settings, dependencies, suspended)
+        except* ComputerSuspendedError as errors:
+            suspended = first_suspension(errors)
+            log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
+            if dependencies.read_setup is not None:
+                with suppress(
+                    ConfigError
+                ):  # a file that is being edited: those in force before the suspension remain
+                    parameters = dependencies.read_setup()
 
 
 async def run_master(
-    config: MasterConfig, parameters: Parameters, settings: LoRaSettings, dependencies: MasterDependencies
+    config: MasterConfig,
+    parameters: Parameters,
+    settings: LoRaSettings,
+    dependencies: MasterDependencies,
+    suspended: ComputerSuspendedError | None = None,
 ) -> None:
     """Receive, compute, stream and record until cancelled; ``parameters`` are those in force.
 
-    Raises RecordingError if the recording cannot be opened. Raises StreamError if the socket cannot be opened.
+    ``suspended``: the computer has just been suspended; an event says so.
+
+    Raises RecordingError if the recording cannot be opened. Raises StreamError if the socket cannot be opened. Raises
+    ComputerSuspendedError, in a group, after a suspension, before anything is published or recorded: times of CLOCK_MONOTONIC from
+    before do not compare with later ones, and the timeline would be behind by the time of the suspension.
     """
+    watch = SuspensionWatch(dependencies.suspended_ns)
     clock = dependencies.clock
     timeline = UnixTimeline.fixed_now(clock)
 
@@ -134,6 +166,7 @@ async def run_master(
         alarms = None if config.alarms is None else Alarms(config.alarms, clock, unix_now_ns)
 
         def emit(record: object, line: bytes) -> None:
+            watch.check()
             if isinstance(record, EventRecord):
                 log.info("stream_event", name=record.event, message=record.message)
                 if alarms is not None:
@@ -163,6 +196,8 @@ async def run_master(
                 publisher.put(_setup_record(config, parameters, start_ns, path.name, dependencies.key))
                 if parameters.no_poses is not None:
                     publisher.report(MasterEvent("setup_missing", f"no poses: {parameters.no_poses}"))
+                if suspended is not None:
+                    publisher.report(MasterEvent("computer_resumed", f"the master began anew: {suspended}"))
                 hints = ReacquisitionHints(parameters)
                 link = _link(config, hints, settings, timeline, recording, publisher, dependencies)
 

@@ -81,6 +81,7 @@ def simulate(
             imu_conditions=imu_conditions(faults),
             odometry_conditions=odometry_conditions(faults),
             rollovers=(rolled := rollovers(faults)),
+            master_sleeps=FaultKind.MASTER_SUSPEND in options.faults,
         )
         for station in scenario.stations:
             mission.start_station(station.station)

@@ -12,7 +12,7 @@ import structlog
 
 import tsgt
 from tsgt import service
-from tsgt.clock import SuspensionWatch, UnixTimeline
+from tsgt.clock import SuspensionWatch, UnixTimeline, first_suspension
 from tsgt.errors import ComputerSuspendedError, RecordingError
 from tsgt.radio import Command, MeasureCommand
 from tsgt.radio.superframe import UNKNOWN_CONDITION, InstrumentCondition, InstrumentState
@@ -59,16 +59,7 @@ async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies:
                 config, settings, replace(dependencies, boot=watch.boot(dependencies.boot)), watch
             )
         except* ComputerSuspendedError as errors:
-            log.warning("computer_resumed", for_s=round(_first(errors).for_s, 3))
-
-
-def _first(errors: BaseExceptionGroup[ComputerSuspendedError]) -> ComputerSuspendedError:
-    error: BaseException = errors
-    while isinstance(error, BaseExceptionGroup):
-        error = error.exceptions[0]
-    if not isinstance(error, ComputerSuspendedError):
-        raise TypeError(f"expected ComputerSuspendedError, got {error!r}")
-    return error
+            log.warning("computer_resumed", for_s=round(first_suspension(errors).for_s, 3))
 
 
 async def _run_until_suspended(

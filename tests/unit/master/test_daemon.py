@@ -226,6 +226,29 @@ async def test_recording_equals_stream_and_replay(tmp_path: Path, protocol: dict
     assert {"geofence_exited", "geofence_entered", "station_lost 3"} <= set(events(field))
 
 
+async def test_suspended_master_begins_anew(tmp_path: Path) -> None:
+    """Its clock stood still: nothing more is published on the old timeline, an event says why, stations join the new session."""
+    suspended_ns = 0
+    async with (
+        field_of(tmp_path, DRIVING) as field,
+        running(field.master(suspended_ns=lambda: suspended_ns)),
+    ):
+        await asyncio.sleep(12)
+        published, first = len(field.records), field.recording()
+        assert field.of(PoseRecord)[-1].valid
+        suspended_ns = 8_000_000_000
+        await asyncio.sleep(12)
+    assert isinstance(field.records[published], SetupRecord)
+    assert events(field)[-1] == "computer_resumed"
+    assert len(list((tmp_path / "recordings").iterdir())) == 2
+    lines = [encode_line(record) for record in field.records]
+    assert [line.data for line in list(read_lines(first))[2:]] == lines[:published]
+    assert [line.data for line in list(read_lines(field.recording()))[2:]] == lines[published:]
+    again = field.records[published:]
+    assert {m.station for m in again if isinstance(m, PolarMeasurement)} == set(STATIONS)
+    assert [pose for pose in again if isinstance(pose, PoseRecord)][-1].valid
+
+
 UNCALIBRATED = replace(DRIVING.parameters, prisms=(), no_poses="not calibrated")
 
 

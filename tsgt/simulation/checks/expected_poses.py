@@ -35,7 +35,7 @@ def missing_poses(result: MissionResult) -> Iterator[str]:
     if result.faults_end_s is not None or result.moves or len(result.parameters.prisms) < MIN_PRISMS:
         return
     for master_log in result.master_logs:
-        expected = len(measured_epochs(master_log, result))
+        expected = len(measured_epochs(master_log, result.in_force(master_log)))
         if expected < MIN_EXPECTED:
             continue
         poses = master_log.valid_poses()

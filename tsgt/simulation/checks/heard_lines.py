@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from array import array
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from tsgt.simulation.mission import MasterLog
 
 _GREETING_LINES = 2
 """The greeting and the newest set-up."""
+
+
+def is_part_of_stream(master_log: MasterLog, heard: Sequence[int]) -> bool:
+    """Whether a reader's lines, as hashes, are the greeting, a published set-up, and then successive lines of the stream."""
+    lines = array("q", heard[_GREETING_LINES:])
+    if len(heard) >= _GREETING_LINES and heard[1] not in master_log.setup_hashes:
+        return False
+    published = master_log.line_hashes
+    starts = (at for at, line in enumerate(published) if line == lines[0]) if lines else ()
+    return not lines or any(published[at : at + len(lines)] == lines for at in starts)
 
 
 def heard_failures(master_log: MasterLog) -> Iterator[str]:

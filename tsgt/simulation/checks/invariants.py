@@ -32,7 +32,7 @@ from tsgt.simulation.checks.pose_lateness import lateness_failures
 from tsgt.simulation.checks.pose_rules import rule_failures
 from tsgt.simulation.checks.pose_twists import twist_failures
 from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
-from tsgt.simulation.checks.setup_lines import beacon_failures, setup_failures
+from tsgt.simulation.checks.setup_lines import beacon_failures, parameter_failures, setup_failures
 from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.station_reports import report_failures
 from tsgt.simulation.checks.status_numbers import status_failures
@@ -103,18 +103,20 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
     found += (Violation("status", what) for what in outstanding_failures(result))
     found += (Violation("status", what) for what in report_failures(result))
     for master_log in result.master_logs:
+        in_force = result.in_force(master_log)
+        found += (Violation("setup", what) for what in parameter_failures(master_log, in_force.parameters))
         found += (Violation("recording", what) for what in recording_failures(master_log))
         found += (Violation("status", what) for what in size_failures(master_log))
         found += (Violation("stream", what) for what in heard_failures(master_log))
-        found += (Violation("setup", what) for what in setup_failures(master_log, result))
+        found += (Violation("setup", what) for what in setup_failures(master_log, in_force))
         found += (Violation("recording", what) for what in beacon_failures(master_log, indices))
         found += (Violation("status", what) for what in status_failures(master_log, indices))
         found += (Violation("lost", what) for what in unpublished_replies(master_log))
-        found += (Violation("pose", what) for what in age_failures(master_log, result.parameters))
-        found += (Violation("pose", what) for what in lateness_failures(master_log, result, indices))
-        found += (Violation("pose", what) for what in scale_failures(master_log, result))
-        found += (Violation("pose", what) for what in twist_failures(master_log, result))
-        found += (Violation("pose", what) for what in rule_failures(master_log, result.parameters))
+        found += (Violation("pose", what) for what in age_failures(master_log, in_force.parameters))
+        found += (Violation("pose", what) for what in lateness_failures(master_log, in_force, indices))
+        found += (Violation("pose", what) for what in scale_failures(master_log, in_force))
+        found += (Violation("pose", what) for what in twist_failures(master_log, in_force))
+        found += (Violation("pose", what) for what in rule_failures(master_log, in_force.parameters))
         found += (
             Violation("event", what) for what in event_failures(master_log, superframe=result.superframe)
         )
@@ -123,7 +125,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
         found += timestamp_violations(
             master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)
         )
-        found += (Violation("pose", what) for what in pose_failures(master_log, result))
+        found += (Violation("pose", what) for what in pose_failures(master_log, in_force))
         if replay:
             found += replay_mismatches(master_log)
     found += (Violation("imu", what) for what in imu_failures(result))

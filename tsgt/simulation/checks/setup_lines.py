@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.geometry import rotation_from_quaternion
+from tsgt.recording import encode_line, read_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from tsgt.model import Parameters
     from tsgt.simulation.mission import JournalIndex, MasterLog, MissionResult
 
 _TOLERANCE = 1e-9
+_HEAD_LINES = 2
 
 MAX_BEACON_ERROR_US = 1000.0
 """Scatter of the differences between recorded and sent times of beacons in a session; frames differ by milliseconds."""
@@ -37,6 +40,16 @@ def setup_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str
         for prism in setup.prisms:
             if not np.allclose(prism.position_m, prisms[prism.id], atol=_TOLERANCE):
                 yield f"prism {prism.id}: the published set-up has another position than the parameters"
+
+
+def parameter_failures(master_log: MasterLog, parameters: Parameters) -> Iterator[str]:
+    """Yield a recording whose parameters are not those that the master was started with."""
+    path = master_log.recording()
+    if path is None:
+        return
+    lines = [line.data for _, line in zip(range(_HEAD_LINES), read_lines(path), strict=False)]
+    if len(lines) == _HEAD_LINES and lines[1] != encode_line(parameters):
+        yield f"{path.name}: its parameters are not those in force"
 
 
 def beacon_failures(master_log: MasterLog, indices: Mapping[int, JournalIndex]) -> Iterator[str]:

@@ -148,6 +148,12 @@ class FaultKind(StrEnum):
     """A station is set up elsewhere with another horizontal zero, and calibrated some time later or never."""
     ROBOT_ROLLOVER = "robot-rollover"
     """The robot rolls over by 90 to 180 degrees, lies with its prisms hidden, and is put on its wheels again."""
+    CONFIG_EDIT = "config-edit"
+    """A daemon's configuration is edited and the daemon restarted; later it is taken back, likewise."""
+    MASTER_SUSPEND = "master-suspend"
+    """The master's computer is suspended and resumed."""
+    LONG_DISK_FULL = "long-disk-full"
+    """A disk is full for an hour."""
 
 
 # Further kinds come last: the draws of the others stay the same. Kinds from SLOW_DISK on have a generator each.
@@ -225,6 +231,9 @@ _RATES: Final = {
     FaultKind.TRIPOD_SUN: _FaultRate(4, _S, (30, 300)),
     FaultKind.STATION_MOVED: _FaultRate(2, _S, (20, 90)),
     FaultKind.ROBOT_ROLLOVER: _FaultRate(4, _M, (5, 40)),
+    FaultKind.CONFIG_EDIT: _FaultRate(2, _B, (20, 120)),
+    FaultKind.MASTER_SUSPEND: _FaultRate(6, _M, (0.05, 60)),
+    FaultKind.LONG_DISK_FULL: _FaultRate(0.3, _B, (3600, 3600)),
 }
 
 _SWITCHED_ON: Final = frozenset({FaultKind.POWER, FaultKind.BATTERY_FADING})
@@ -262,6 +271,8 @@ FIELD_DAY_FAULTS: Final = frozenset(
         FaultKind.TRIPOD_SUN,
         FaultKind.STATION_MOVED,
         FaultKind.ROBOT_ROLLOVER,
+        FaultKind.MASTER_SUSPEND,
+        FaultKind.LONG_DISK_FULL,
     }
 )
 """Kinds that are injected by name only: what they violate is bounded, or they need a mission of their own."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from tsgt.simulation.faults.catalogue import RELOCK_DELAY_S, FaultKind
 from tsgt.simulation.faults.computers import COMPUTER_INJECTORS
+from tsgt.simulation.faults.operations import OPERATION_INJECTORS
 from tsgt.simulation.faults.optics import OPTICS_INJECTORS
 from tsgt.simulation.faults.setup_mistakes import MISTAKE_INJECTORS
 from tsgt.simulation.faults.tripods import TRIPOD_INJECTORS
@@ -347,4 +348,5 @@ _INJECTORS: Final[Mapping[FaultKind, Callable[[Mission, Fault, np.random.Generat
     **MISTAKE_INJECTORS,
     **OPTICS_INJECTORS,
     **TRIPOD_INJECTORS,
+    **OPERATION_INJECTORS,
 }

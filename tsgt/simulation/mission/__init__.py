@@ -5,6 +5,7 @@ the ground truth. `Mission` also starts, stops, kills and reboots computers for 
 """
 
 from tsgt.simulation.mission.computer import MASTER
+from tsgt.simulation.mission.config_edits import MasterEdit
 from tsgt.simulation.mission.daemon_configs import has_odometry, instrument_config, station_name
 from tsgt.simulation.mission.mission import DRAIN_S, Mission
 from tsgt.simulation.mission.run_log import (
@@ -23,6 +24,7 @@ __all__ = [
     "DRAIN_S",
     "MASTER",
     "JournalIndex",
+    "MasterEdit",
     "MasterLog",
     "Mission",
     "MissionResult",

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.clock import first_suspension
 from tsgt.config import SuperframeMasterConfig, level_frame, scenario_parameters
+from tsgt.errors import ComputerSuspendedError
 from tsgt.estimation import start_now
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
@@ -27,6 +29,7 @@ from tsgt.simulation.lora import Air, TimestampJitter, radio_opener, scenario_li
 from tsgt.simulation.lora.adversary import ReplayAttacker
 from tsgt.simulation.mission.authors_node import AuthorsNode
 from tsgt.simulation.mission.computer import MASTER, Computer
+from tsgt.simulation.mission.config_edits import NO_EDIT, MasterEdit
 from tsgt.simulation.mission.daemon_configs import (
     STATUS_SOCKET,
     client_config,
@@ -107,6 +110,7 @@ class Mission:
     """A mission; create and use it in a running event loop on virtual time. Dictionaries are keyed by station number.
 
     ``imu_conditions``, ``odometry_conditions``: faults of the robot's IMU and wheel odometry; ``rollovers``: of the robot.
+    ``master_sleeps``: the master's computer can be suspended, for which it needs a slower clock.
     """
 
     def __init__(
@@ -119,6 +123,7 @@ class Mission:
         imu_conditions: Sequence[ImuCondition] = (),
         odometry_conditions: Sequence[OdometryCondition] = (),
         rollovers: Sequence[Rollover] = (),
+        master_sleeps: bool = False,
     ) -> None:
         rng = np.random.default_rng(options.seed)
         world_rng, air_rng, master_rng, clock_rng, *station_rngs = rng.spawn(4 + len(scenario.stations))
@@ -128,7 +133,9 @@ class Mission:
         self._options = options
         self._folder = folder
         self._true = VirtualClock(START_UNIX_NS, timeline)
-        self.clock = VirtualClock(START_UNIX_NS, timeline)  # the master's clock
+        self.clock: VirtualClock | DriftingClock = VirtualClock(START_UNIX_NS, timeline)  # the master's clock
+        if master_sleeps:
+            self.clock = DriftingClock(self._true)
         self._settings = lora_settings(
             radio_config(scenario, MASTER, folder), Path(f"scenario {scenario.name}")
         )
@@ -188,6 +195,7 @@ class Mission:
         self._placed = {s.station: s for s in scenario.stations}  # where the stations are now
         self.moves: list[StationMove] = []
         self.mistakes: dict[int, SetupMistake] = {}  # in force from the next start of the client on
+        self.edit = NO_EDIT  # of the master's configuration, likewise
         self.drifting: set[int] = set()  # stations whose clock drift is changing
         self.superframe = isinstance(options.protocol, SuperframeMasterConfig)
         self.station_logs = {
@@ -278,9 +286,22 @@ class Mission:
 
     def start_master(self) -> None:
         """Start the master with a new recording."""
+        master = self._new_master()
+        sleeps = isinstance(self.clock, DriftingClock)
+        self.computers[MASTER].start(self._through_suspensions(master) if sleeps else master)
+
+    def _new_master(self, suspended: ComputerSuspendedError | None = None) -> Coroutine[None, None, None]:
         master_log = self._new_master_log(f"master{len(self.master_logs)}", self.clock)
         self.master_logs.append(master_log)
-        self.computers[MASTER].start(self._master(master_log, self.computers[MASTER], self.clock))
+        return self._master(master_log, self.computers[MASTER], self.clock, suspended)
+
+    async def _through_suspensions(self, master: Coroutine[None, None, None]) -> None:
+        """Run the master, and after each suspension another one, as :func:`~tsgt.master.daemon.run_through_suspensions` does."""
+        while True:
+            try:
+                await master
+            except* ComputerSuspendedError as errors:
+                master = self._new_master(first_suspension(errors))
 
     async def run_second_master(self, for_s: float) -> None:
         """Run another master with the same key, stations and set-up beside the robot's, and then stop it."""
@@ -294,15 +315,29 @@ class Mission:
         await asyncio.sleep(for_s)
         await computer.stop()
 
-    def _new_master_log(self, folder: str, clock: VirtualClock) -> MasterLog:
-        unix_at_zero_ns = clock.realtime_ns() - clock.monotonic_ns()
+    def _new_master_log(self, folder: str, clock: VirtualClock | DriftingClock) -> MasterLog:
+        unix_at_zero_ns = clock.realtime_ns() - self._true.monotonic_ns()
         return MasterLog(self._folder / folder, self._true.monotonic_ns, unix_at_zero_ns, self.parameters)
 
     def _master(
-        self, master_log: MasterLog, computer: Computer, clock: VirtualClock
+        self,
+        master_log: MasterLog,
+        computer: Computer,
+        clock: VirtualClock | DriftingClock,
+        suspended: ComputerSuspendedError | None = None,
     ) -> Coroutine[None, None, None]:
         folder = master_log.folder
-        config = master_config(self._scenario, self._options, folder)
+        scenario, settings = self.edit.applied_to(self._scenario), self.edit.applied_to_radio(self._settings)
+        config = master_config(scenario, self._options, folder)
+        parameters = self.parameters
+        if self.edit is not NO_EDIT:
+            edited = scenario_parameters(scenario)
+            frames = {each.station: each.T_station1_station for each in parameters.stations}
+            stations = (replace(s, T_station1_station=frames[s.station]) for s in edited.stations)
+            parameters = replace(
+                edited, stations=tuple(stations), imu=parameters.imu, odometry=parameters.odometry
+            )
+        master_log.parameters = parameters
         start_imu = None
         if self.imu is not None:
             start_imu = ImuProgram(IMU_MODELS[self._scenario.imu.model], self.imu.samples, clock).start
@@ -311,13 +346,13 @@ class Mission:
             start_odometry = OdometryProgram(self.odometry, clock).start
         folder.mkdir()
         writer = computer.new_writer()
-        open_radio = computer.radio()
+        open_radio = computer.radio(settings)
         if not self.superframe:
             open_radio = observed(open_radio, master_log.poll_replies.append)
         return run_master(
             config,
-            self.parameters,
-            self._settings,
+            parameters,
+            settings,
             MasterDependencies(
                 open_radio=open_radio,
                 clock=clock,
@@ -329,8 +364,10 @@ class Mission:
                 write=writer.write,
                 sync=writer.sync,
                 disk_status=lambda _folder: computer.disk.status(),
+                suspended_ns=lambda: computer.suspended_ns,
                 start_check=start_now,  # no other thread: it would break on a look at all objects
             ),
+            suspended,
         )
 
     def start_station(self, station: int) -> None:
@@ -363,6 +400,8 @@ class Mission:
         if not mistake.delivers:  # what it measures is of no station of the mission
             folder, station_log = folder / "mistake", StationLog(station, None)
             entry = entry.model_copy(update={"station": mistake.station or station})
+        if mistake.prism is not None:
+            entry = entry.model_copy(update={"prism": mistake.prism})
         folder.mkdir(exist_ok=True)
 
         def on_reading(reading: Reading) -> None:
@@ -445,6 +484,15 @@ class Mission:
         station_log = self.station_logs[self._station(computer.name)]
         station_log.crash_windows_ns.append((computer.disk.failing_since_ns(now_ns), now_ns))
 
+    async def suspend_master(self, for_s: float) -> None:
+        """Suspend the master's computer; no effect on one that is down."""
+        computer = self.computers[MASTER]
+        if computer.is_down or computer.is_suspended:
+            return
+        resume = computer.suspend()
+        await asyncio.sleep(for_s)
+        resume()
+
     async def suspend(self, station: int, for_s: float) -> None:
         """Suspend a station's computer, whose instrument's responses are lost meanwhile; no effect on one that is down."""
         computer, line = self._computer(station), self.lines[station]
@@ -466,6 +514,16 @@ class Mission:
         await asyncio.sleep(for_s)
         del self.mistakes[station]
         await self.restart(station, self.now_s)
+
+    async def edit_master(self, edit: MasterEdit, for_s: float) -> None:
+        """Restart the master with another configuration, and after some time with its own one."""
+        if self.edit is not NO_EDIT or self.computers[MASTER].is_down:
+            return
+        self.edit = edit
+        await self.restart(None, self.now_s)
+        await asyncio.sleep(for_s)
+        self.edit = NO_EDIT
+        await self.restart(None, self.now_s)
 
     async def _record_status(self, name: str) -> None:
         """Record a client's status before it ends; the authors' node has none."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -440,6 +440,10 @@ class MissionResult:
     def end_ns(self) -> int:
         """Unix time of the end on the master's clock, in ns; the drain follows."""
         return self.start_ns + round(self.duration_s * 1e9)
+
+    def in_force(self, master_log: MasterLog) -> MissionResult:
+        """Return the mission with the parameters with which a master was started."""
+        return replace(self, parameters=master_log.parameters or self.parameters)
 
     def true_poses(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the true poses of the reference point, (N, 4, 4), at N instants in s from the start."""

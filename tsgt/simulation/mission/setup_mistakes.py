@@ -15,8 +15,10 @@ class SetupMistake:
 
     key: bytes | None = None  # None: the mission's
     spreading_factor: int | None = None  # None: the mission's
+    frequency_mhz: float | None = None  # None: the mission's
     classic: bool = False  # whether it speaks classic though the mission speaks superframe
     station: int | None = None  # station number; None: its own
+    prism: int | None = None  # that it tracks from the start; None: its own
     prism_constant_mm: float = 0.0  # what the instrument adds, besides the master
 
     @property
@@ -26,9 +28,11 @@ class SetupMistake:
 
     def applied_to(self, settings: LoRaSettings) -> LoRaSettings:
         """Return the settings of its radio."""
-        if self.spreading_factor is None:
-            return settings
-        return replace(settings, spreading_factor=self.spreading_factor)
+        if self.spreading_factor is not None:
+            settings = replace(settings, spreading_factor=self.spreading_factor)
+        if self.frequency_mhz is not None:
+            settings = replace(settings, frequency_hz=round(self.frequency_mhz * 1e6))
+        return settings
 
 
 NO_MISTAKE = SetupMistake()

@@ -1,0 +1,132 @@
+"""Edited configurations, a master that sleeps, and a disk that is full for long."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from harness.missions import SUPERFRAME, run_mission
+
+from tsgt.recording import load_recording
+from tsgt.simulation.checks import check_invariants
+from tsgt.simulation.checks.setup_lines import parameter_failures
+from tsgt.simulation.faults import FaultKind, draw_faults
+from tsgt.simulation.mission import MasterEdit, SetupMistake
+from tsgt.simulation.scenario_files import find_scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+    from pathlib import Path
+
+    from tsgt.simulation.mission import Mission, MissionResult
+
+
+def _run(
+    folder: Path,
+    script: Callable[[Mission], Coroutine[None, None, None]] | None,
+    duration_s: float,
+    faults: frozenset[FaultKind] = frozenset(),
+    seed: int = 0,
+) -> MissionResult:
+    scenario = find_scenario("dynamic")
+    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
+    return run_mission(
+        folder,
+        scenario.model_copy(update={"pipeline": pipeline}),
+        script=script,
+        protocol=SUPERFRAME,
+        duration_s=duration_s,
+        faults=faults,
+        seed=seed,
+    )
+
+
+def _missing(result: MissionResult) -> dict[int, int]:
+    """Return how many readings of each station no master has published."""
+    missing = {number: len(log.true_times_ns) for number, log in result.station_logs.items()}
+    for master_log in result.master_logs:
+        for measurement in master_log.measurements:
+            missing[measurement.station] -= 1
+    return missing
+
+
+@pytest.mark.slow
+def test_edited_pose_rate_is_in_force_from_the_restart_on(tmp_path: Path) -> None:
+    """The recording states it, the poses follow it, and the recording after it is taken back has the old one."""
+
+    async def edit(mission: Mission) -> None:
+        await mission.sleep_until(8.0)
+        await mission.edit_master(MasterEdit(pipeline={"rate_hz": 5.0}), 10.0)
+
+    result = _run(tmp_path, edit, 32.0)
+    assert check_invariants(result) == []
+    recordings = [load_recording(path) for log in result.master_logs if (path := log.recording())]
+    assert [each.parameters.pipeline.period_ns for each in recordings] == [
+        50_000_000,
+        200_000_000,
+        50_000_000,
+    ]
+    assert parameter_failures_of(result) == [0, 1, 0]
+    assert max(_missing(result).values()) <= 3
+
+
+def parameter_failures_of(result: MissionResult) -> list[int]:
+    """Return by master how many recordings do not have the mission's parameters."""
+    return [len(list(parameter_failures(log, result.parameters))) for log in result.master_logs]
+
+
+@pytest.mark.slow
+def test_station_missing_in_the_master_and_wrong_channel_lose_nothing(tmp_path: Path) -> None:
+    """Backlogs arrive after the correction: of a station that the list lacked, and of all that heard no beacon."""
+
+    async def edit(mission: Mission) -> None:
+        await mission.sleep_until(6.0)
+        await mission.edit_master(MasterEdit(without_station=2), 6.0)
+        await mission.sleep_until(22.0)
+        await mission.edit_master(MasterEdit(frequency_mhz=907.4), 8.0)
+
+    result = _run(tmp_path, edit, 50.0)
+    assert check_invariants(result, replay=False) == []
+    assert [len({m.station for m in log.measurements}) for log in result.master_logs[1::2]] == [2, 0]
+    assert max(_missing(result).values()) <= 3
+
+
+@pytest.mark.slow
+def test_client_on_another_channel_or_prism_loses_nothing(tmp_path: Path) -> None:
+    """The backlog of the wrong channel arrives; a client with another prism is told the right one by the master."""
+
+    async def edit(mission: Mission) -> None:
+        await mission.sleep_until(6.0)
+        await mission.make_mistake(1, SetupMistake(frequency_mhz=907.4), 8.0)
+        await mission.make_mistake(3, SetupMistake(prism=1), 8.0)
+
+    result = _run(tmp_path, edit, 50.0)
+    assert check_invariants(result, replay=False) == []
+    assert max(_missing(result).values()) <= 3
+
+
+@pytest.mark.slow
+def test_suspended_master_begins_anew(tmp_path: Path) -> None:
+    """No pose and no time of its old timeline is published after it resumes; stations deliver what they measured meanwhile."""
+
+    async def suspend(mission: Mission) -> None:
+        await mission.sleep_until(10.0)
+        await mission.suspend_master(8.0)
+
+    # The kind gives the master a clock that can stand still; this seed draws none.
+    result = _run(tmp_path, suspend, 44.0, frozenset({FaultKind.MASTER_SUSPEND}))
+    assert not result.faults
+    before, after = result.master_logs
+    assert check_invariants(result) == []
+    assert [event.event for event in after.events][:1] == ["computer_resumed"]
+    assert max(_missing(result).values()) <= 3
+    assert before.statuses[-1].stamp_ns < after.statuses[0].stamp_ns - 7_000_000_000
+    assert after.valid_poses().stamp_ns.size > 300
+
+
+def test_long_faults_come_in_missions_of_hours() -> None:
+    """A mission of ten hours has disks that are full for an hour."""
+    rng = np.random.default_rng(1)
+    drawn = draw_faults([FaultKind.LONG_DISK_FULL], rng, duration_s=36_000.0, stations=(1, 2, 3))
+    assert max(fault.duration_s for fault in drawn) == pytest.approx(3600.0)

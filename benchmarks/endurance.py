@@ -4,7 +4,7 @@ Run it with ``python benchmarks/run.py endurance --minutes 30 --loss 0.05``. Air
 processes of their own, as are sockets, serial lines (pseudo-terminals), files and time real; radios and instruments are
 simulated, as in ``tsgt demo``. The master is ended after one minute and killed after two, and then left alone; client 1
 is killed and ended in turn every two minutes; the other clients and the air server run through. A reader follows the
-stream. At the end the instruments are unplugged, the stations have to deliver all they have, and files are checked.
+stream, another one the relay, and a browser's connection the operator's page: both are processes of their own, too. At the end the instruments are unplugged, the stations have to deliver all they have, and files are checked.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from endurance_subscribers import Subscribers
 from endurance_watch import (
     Sample,
     Stream,
@@ -97,6 +98,7 @@ class Endurance:
         )
         self._loads: list[float] = []
         self._streams: list[Stream] = []
+        self._subscribers = Subscribers(folder, self._files.socket)
         self._ends: Counter[str] = Counter()
         self._said: defaultdict[int, dict[int, dict[str, Any]]] = defaultdict(dict)
 
@@ -125,7 +127,17 @@ class Endurance:
                 lines.append(await stack.enter_async_context(line))
             self._began_s = time.monotonic()
             daemons = [asyncio.create_task(process.keep_running()) for process in self._demo.processes]
-            watching = [asyncio.create_task(each) for each in (self._read(), self._listen(), self._sample())]
+            await stack.enter_async_context(self._subscribers)
+            watching = [
+                asyncio.create_task(each)
+                for each in (
+                    self._read(),
+                    self._listen(),
+                    self._sample(),
+                    self._subscribers.follow_relay(),
+                    self._subscribers.follow_page(),
+                )
+            ]
             try:
                 await self._end_daemons()
                 for task in watching:
@@ -177,6 +189,8 @@ class Endurance:
         while True:
             self._loads.append(os.getloadavg()[0])
             self._look("air server", self._air_pid)
+            for name, pid in self._subscribers.pids.items():
+                self._look(name, pid)
             for process in self._demo.processes:
                 if process.pid is not None:
                     self._look(process.name, process.pid)
@@ -252,6 +266,10 @@ class Endurance:
         found.violations += self._wrong_ends(queued)
         if air_ended:
             found.violations.append(Violation("ended", "the air server has ended"))
+        read = sum(len(epochs) for each in self._streams for epochs in each.epochs_ns.values())
+        found.violations += (
+            Violation("passed on", what) for what in self._subscribers.failures(recordings, read)
+        )
         stream, period_ns = self._streams[-1], round(1e9 / self._scenario.pipeline.rate_hz)
         return {
             "minutes": self._duration_s / 60,
@@ -274,6 +292,7 @@ class Endurance:
                 },
                 "invalid": {reason: count for reason, count in stream.reasons.items() if count},
             },
+            "subscribers": self._subscribers.counts(),
             "counts": dict(found.counts),
             "violations": [violation._asdict() for violation in found.violations],
             "samples": {
@@ -380,6 +399,7 @@ def _print(result: dict[str, Any]) -> None:
             f"  {kind}: {each['count']}, {each['valid_share']:.2%} valid, {each['missing_epochs']} epochs missing"
         )
     print(f"  invalid because: {stream['invalid'] or 'none was'}")
+    print("subscribers: " + ", ".join(f"{count} {what}" for what, count in result["subscribers"].items()))
     print("files: " + ", ".join(f"{count} {what}" for what, count in result["counts"].items()))
     print(f"{len(result['violations'])} violations")
     for each in result["violations"]:

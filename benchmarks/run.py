@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-SHARED = {"run", "measuring", "endurance_watch", "planted_by_strangers"}
+SHARED = {"run", "measuring", "endurance_subscribers", "endurance_watch", "planted_by_strangers"}
 
 
 def names() -> list[str]:

@@ -38,6 +38,7 @@ from tsgt.simulation.mission.daemon_configs import (
     radio_config,
     station_name,
 )
+from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
 from tsgt.simulation.mission.poll_replies import observed
 from tsgt.simulation.mission.run_log import (
     START_UNIX_NS,
@@ -348,7 +349,7 @@ class Mission:
         writer = computer.new_writer()
         open_radio = computer.radio(settings)
         if not self.superframe:
-            open_radio = observed(open_radio, master_log.poll_replies.append)
+            open_radio = observed(open_radio, lambda reply: master_log.observe_reply(reply, clock.true_ns))
         return run_master(
             config,
             parameters,
@@ -484,6 +485,16 @@ class Mission:
         station_log = self.station_logs[self._station(computer.name)]
         station_log.crash_windows_ns.append((computer.disk.failing_since_ns(now_ns), now_ns))
 
+    def _note_waiting_lines(self, computer: Computer) -> None:
+        """Record that a daemon that is stopped while its disk fails leaves its disk as one that is killed does."""
+        now_ns = self._true.monotonic_ns()
+        if computer.disk.failing_since_ns(now_ns) == now_ns - UNWRITTEN_WINDOW_NS:
+            return
+        if computer.name == MASTER:
+            self.master_logs[-1].crashed = True
+        else:
+            self._record_crash_window(computer)
+
     async def suspend_master(self, for_s: float) -> None:
         """Suspend the master's computer; no effect on one that is down."""
         computer = self.computers[MASTER]
@@ -545,6 +556,7 @@ class Mission:
         while computer.is_down or computer.is_suspended:  # noqa: ASYNC110 (waits in virtual time)
             await asyncio.sleep(RESTART_DELAY_S)
         computer.is_down = True
+        self._note_waiting_lines(computer)
         await self.stop(name)
         await asyncio.sleep(RESTART_DELAY_S)
         computer.is_down = False

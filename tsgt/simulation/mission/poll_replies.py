@@ -18,7 +18,7 @@ class PollReply(NamedTuple):
 
     station: int  # that was polled
     payload: bytes
-    received_at_ns: int  # on the clock of the master's radio
+    received_at_ns: int  # on the clock of the master's radio; in a log, true time from the start
 
 
 class ObservedRadio:

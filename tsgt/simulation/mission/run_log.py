@@ -197,6 +197,10 @@ class MasterLog:
         self._counts = self._counts._replace(measurements=len(self.measurements))
         self._counts_before_poses = self._counts
 
+    def observe_reply(self, reply: PollReply, true_ns: Callable[[int], int]) -> None:
+        """Log a reply over protocol classic with its true time; ``true_ns`` converts that of the master's clock."""
+        self.poll_replies.append(reply._replace(received_at_ns=true_ns(reply.received_at_ns)))
+
     def _observe_epoch(self, pose: PoseRecord) -> None:
         self.pose_counts[pose.series] += 1
         self.epochs_ns.setdefault(pose.series, array("q")).append(pose.stamp_ns)

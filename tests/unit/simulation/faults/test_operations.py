@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+from functools import partial
 from typing import TYPE_CHECKING
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from harness.missions import SUPERFRAME, run_mission
 
 from tsgt.recording import load_recording
+from tsgt.recording.recorder import Recorder
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.setup_lines import parameter_failures
 from tsgt.simulation.faults import FaultKind, draw_faults
-from tsgt.simulation.mission import MasterEdit, SetupMistake
+from tsgt.simulation.mission import MASTER, MasterEdit, SetupMistake
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -123,6 +127,32 @@ def test_suspended_master_begins_anew(tmp_path: Path) -> None:
     assert max(_missing(result).values()) <= 3
     assert before.statuses[-1].stamp_ns < after.statuses[0].stamp_ns - 7_000_000_000
     assert after.valid_poses().stamp_ns.size > 300
+
+
+@pytest.mark.slow
+def test_disk_that_is_full_for_longer_than_lines_can_wait(tmp_path: Path) -> None:
+    """Lines are lost, poses among them; measurements are delivered again, so that each is in the recording once."""
+
+    async def fill(mission: Mission) -> None:
+        await mission.sleep_until(6.0)
+        disk = mission.computers[MASTER].disk
+        disk.fail_writes(errno.ENOSPC, 6_000_000_000, 20_000_000_000)
+        await mission.sleep_until(20.0)
+        disk.write_error = None
+
+    with patch("tsgt.master.daemon.Recorder", partial(Recorder, max_pending_lines=150)):
+        result = _run(tmp_path, fill, 36.0)
+    (log,) = result.master_logs
+    status, path = log.statuses[-1].recording, log.recording()
+    assert status is not None
+    assert path is not None
+    assert status.lost_lines > 100
+    found = check_invariants(result)
+    assert {each.check for each in found} <= {"recording", "replay", "duplicate", "status"}
+    recorded = [(m.station, m.sequence) for m in load_recording(path).measurements]
+    assert len(recorded) == len(set(recorded))
+    read = sum(len(station.true_times_ns) for station in result.station_logs.values())
+    assert len(recorded) >= read - 9
 
 
 def test_long_faults_come_in_missions_of_hours() -> None:

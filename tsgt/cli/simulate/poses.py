@@ -126,13 +126,18 @@ def _processed_figures(run: MissionResult, recording: Recording) -> EstimatorFig
 
 
 def live_figures(run: MissionResult) -> dict[str, LivePoses]:
-    """Compare the streamed poses with the truth, by series; of predicted ones also those that rest on the IMU."""
+    """Compare the streamed poses with the truth, by series; of predicted ones also those that rest on the IMU.
+
+    Those of a master with another reference point, by a fault, are left out.
+    """
+    point = run.parameters.reference_point
+    sessions = [log for log in run.master_logs if run.in_force(log).parameters.reference_point == point]
     counts: Counter[str] = Counter()
-    for session in run.master_logs:
+    for session in sessions:
         counts.update(session.pose_counts)
         if session.predicted_with_imu:
             counts[PREDICTED_WITH_IMU] += session.predicted_with_imu
-    streamed = [session.valid_poses() for session in run.master_logs]
+    streamed = [session.valid_poses() for session in sessions]
     found = {}
     for series, count in sorted(counts.items()):
         if series == PREDICTED_WITH_IMU:
@@ -142,7 +147,7 @@ def live_figures(run: MissionResult) -> dict[str, LivePoses]:
         stamp_ns = np.concatenate(
             [
                 poses.stamp_ns + run.start_ns - session.unix_at_zero_ns
-                for session, poses in zip(run.master_logs, some, strict=True)
+                for session, poses in zip(sessions, some, strict=True)
             ]
         )
         age_name = "newest_age_s" if series.startswith("predicted") else "sent_age_s"

@@ -338,6 +338,7 @@ def test_poses_that_the_measurements_allow(tmp_path: Path, valid: int, count: in
     poses = [replace(POSE, valid=number < valid, reason="") for number in range(140)]
     log = _log(tmp_path, *measured, *poses)
     result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, moves=(), master_logs=[log])
+    result.in_force = lambda _log: result
     assert len(list(missing_poses(result))) == count
     result.faults_end_s = 180.0
     assert not list(missing_poses(result))
@@ -352,6 +353,7 @@ def test_no_poses_are_expected_of_a_backlog(tmp_path: Path) -> None:
     ]
     log = _log(tmp_path, *measured, replace(POSE, valid=False, reason="outage"))
     result: Any = SimpleNamespace(parameters=PARAMETERS, faults_end_s=None, moves=(), master_logs=[log])
+    result.in_force = lambda _log: result
     assert not list(missing_poses(result))
 
 

@@ -71,9 +71,9 @@ class Subscribers:
             self._processes[name] = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "tsgt", name, *arguments, stdout=log_file, stderr=log_file
             )
-        pattern = r"the page is at http://[^:]+:(\d+)" if name == "web" else r"relay_opened.*port=(\d+)"
+        pattern = r"the page is at http://[^:]+:(\d+)" if name == "web" else r'"port": (\d+)'
         while True:
-            text = re.sub(r"\x1b\[[0-9;]*m", "", log.read_text())
+            text = log.read_text()
             if found := re.search(pattern, text):
                 self._ports[name] = int(found[1])
                 return

@@ -20,14 +20,17 @@ AMBIGUITY_MARGIN_S = 1.5  # Before the first inconsistent measurement: a few of 
 
 
 class InnovationMonitor:
-    """Tracks innovations: the state is ambiguous while the newest of a prism is inconsistent (``inconsistent_prisms``).
+    """Tracks innovations: after an inconsistent one the state is ambiguous until two prisms are consistent in succession.
 
-    ``alone``: as many consistent measurements in succession of one prism resolve an ambiguity without other prisms.
+    A station on a wrong prism agrees with itself, and a trajectory that is bent by a wrong measurement may happen to fit the next
+    one of a single prism. ``inconsistent_prisms``: whose inconsistent measurements are not resolved yet. ``alone``: as many
+    consistent measurements in succession of one prism resolve an ambiguity without other prisms.
     """
 
     def __init__(self, alone: int | None = None) -> None:
         self._alone = alone
         self._succession = 0
+        self._consistent_prisms: frozenset[int] = frozenset()  # since the last inconsistent measurement
         self.inconsistent_prisms: frozenset[int] = frozenset()
         self._inconsistent_from_s = np.inf
         self._flagged = np.empty(0, np.bool_)
@@ -53,6 +56,7 @@ class InnovationMonitor:
         """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
         self._flagged = np.zeros(len(observations), np.bool_)
+        self._consistent_prisms = frozenset()
         self._succession = 0
 
     def set_start(self, time_s: float) -> None:
@@ -93,15 +97,21 @@ class InnovationMonitor:
         for time_s, prism, is_flagged in zip(*rows, strict=True):
             if not self.inconsistent_prisms:
                 self._inconsistent_from_s = time_s
-            # A station on a wrong prism agrees with itself: only other prisms resolve an ambiguity.
-            self.inconsistent_prisms = (
-                self.inconsistent_prisms | {prism} if is_flagged else self.inconsistent_prisms & {prism}
-            )
+            if is_flagged:
+                self.inconsistent_prisms |= {prism}
+                self._consistent_prisms = frozenset()
+            else:
+                self._consistent_prisms |= {prism}
+                if len(self._consistent_prisms) > 1:
+                    self.inconsistent_prisms = frozenset()
             self._succession = 0 if is_flagged else self._succession + 1
             if self._alone is not None and self._succession >= self._alone:
                 self.inconsistent_prisms = frozenset()
         # A flagged measurement that is no outlier has bent the trajectory: consistent innovations before it prove nothing.
-        self.inconsistent_prisms |= frozenset(observations.prism[is_new & flagged & ~outliers].tolist())
+        followed = frozenset(observations.prism[is_new & flagged & ~outliers].tolist())
+        if followed:
+            self.inconsistent_prisms |= followed
+            self._consistent_prisms = frozenset()
         if not self.inconsistent_prisms and flagged.any():
             self._resolve(observations, outliers)
 

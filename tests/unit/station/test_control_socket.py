@@ -20,7 +20,7 @@ from tsgt.station import AtmosphereRequest, ClientDependencies, Condition, run_c
 from tsgt.station.control_socket import MAX_CONNECTIONS
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
+    from collections.abc import AsyncGenerator, Callable
     from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
@@ -193,7 +193,12 @@ async def test_full_disk_is_reported_with_waiting_and_lost_lines(
     monkeypatch.setattr(RecordingWriter, "write_line", write_if_room)
     monkeypatch.setattr(Recorder.__init__, "__kwdefaults__", {"max_pending_lines": 10})
     notified: list[str] = []
-    monkeypatch.setattr("tsgt.service.daemon.sd_notify", lambda *assignments: notified.extend(assignments))
+
+    def notify(*_assignments: str, status: Callable[[], str] | None = None) -> None:
+        if status is not None:
+            notified.append(status())
+
+    monkeypatch.setattr("tsgt.service.daemon.sd_notify", notify)
     async with client(tmp_path) as instrument:
         full = True
         for _ in range(15):

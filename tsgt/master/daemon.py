@@ -103,7 +103,7 @@ async def run_through_suspensions(
 ) -> None:
     """Run the master until cancelled. Raises as :func:`run_master`.
 
-    When the computer has been suspended, all begins anew, as after a restart: recording, session with the stations, timeline.
+    After a suspension of the computer everything restarts: recording, session with the stations, timeline.
     """
     suspended: ComputerSuspendedError | None = None
     while True:
@@ -197,7 +197,7 @@ async def run_master(
                 if parameters.no_poses is not None:
                     publisher.report(MasterEvent("setup_missing", f"no poses: {parameters.no_poses}"))
                 if suspended is not None:
-                    publisher.report(MasterEvent("computer_resumed", f"the master began anew: {suspended}"))
+                    publisher.report(MasterEvent("computer_resumed", f"the master has restarted: {suspended}"))
                 hints = ReacquisitionHints(parameters)
                 link = _link(config, hints, settings, timeline, recording, publisher, dependencies)
 

@@ -96,7 +96,7 @@ class Publisher:
     def set_up(
         self, parameters: Parameters, observers: Sequence[Observer], record: Callable[[bytes], None]
     ) -> None:
-        """Publish the poses that are due by now, and begin anew with other parameters; ``record`` takes their line.
+        """Publish the poses that are due by now, and restart with other parameters; ``record`` takes their line.
 
         The set-up record has to follow, as in a replay.
         """

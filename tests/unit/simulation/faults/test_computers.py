@@ -78,7 +78,7 @@ def test_suspended_computer_is_neither_rebooted_nor_killed(tmp_path: Path) -> No
             await mission.crash("station2", down_s=1.0)
 
     result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=10.0)
-    assert len(result.station_logs[2].journals) == 2  # the client begins anew when it is resumed
+    assert len(result.station_logs[2].journals) == 2  # the client restarts when it is resumed
 
 
 @pytest.mark.slow

@@ -197,7 +197,9 @@ async def run_master(
                 if parameters.no_poses is not None:
                     publisher.report(MasterEvent("setup_missing", f"no poses: {parameters.no_poses}"))
                 if suspended is not None:
-                    publisher.report(MasterEvent("computer_resumed", f"the master has restarted: {suspended}"))
+                    publisher.report(
+                        MasterEvent("computer_resumed", f"the master has restarted: {suspended}")
+                    )
                 hints = ReacquisitionHints(parameters)
                 link = _link(config, hints, settings, timeline, recording, publisher, dependencies)
 

@@ -5,9 +5,13 @@ docs/explanation/imu.md derives the equations.
 """
 
 from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
-from tsgt.geometry.inertial.fixed_lag import InertialFixedLagSmoother, WindowTrajectory
-from tsgt.geometry.inertial.health import DISAGREES_WITH_PRISMS, sound_samples
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
+from tsgt.geometry.inertial.live import (
+    DISAGREES_WITH_PRISMS,
+    InertialFixedLagSmoother,
+    WindowTrajectory,
+    sound_samples,
+)
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
 from tsgt.geometry.inertial.query import InertialTrajectory, strapdown

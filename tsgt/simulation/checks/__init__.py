@@ -3,8 +3,7 @@
 In: a :class:`MissionResult`. Out: violations, each with subject, measured value and limit. `invariants` names them all and
 checks measurements and journals; each other file is one check:
 
-- poses against the truth: `pose_consistency` (each), `covariance_scale`, `pose_lateness`, `pose_twists` (many); against the
-  measurements: `pose_ages`, `expected_poses`; against the documentation: `pose_rules`;
+- `poses` against truth, measurements and documentation: a room of its own;
 - stream and files: `recorded_lines`, `heard_lines`, `setup_lines`, `poll_replies`, `acknowledgements`;
 - status and events: `status_numbers`, `station_reports`, `station_events`, `outstanding`;
 - `liveness` after faults, `memory_bounds`, samples of IMU and wheels (`imu_samples`, `odometry_samples`).

@@ -17,20 +17,22 @@ from tsgt.master.replay import replayed
 from tsgt.model import Status
 from tsgt.recording import load_recording
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
-from tsgt.simulation.checks.covariance_scale import scale_failures
-from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.imu_samples import imu_failures, imu_status_failures
-from tsgt.simulation.checks.layout_events import layout_failures
 from tsgt.simulation.checks.liveness import liveness_failures
 from tsgt.simulation.checks.odometry_samples import odometry_failures
 from tsgt.simulation.checks.outstanding import outstanding_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
-from tsgt.simulation.checks.pose_ages import age_failures
-from tsgt.simulation.checks.pose_consistency import pose_failures
-from tsgt.simulation.checks.pose_lateness import lateness_failures
-from tsgt.simulation.checks.pose_rules import rule_failures
-from tsgt.simulation.checks.pose_twists import twist_failures
+from tsgt.simulation.checks.poses import (
+    age_failures,
+    lateness_failures,
+    layout_failures,
+    missing_poses,
+    pose_failures,
+    rule_failures,
+    scale_failures,
+    twist_failures,
+)
 from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
 from tsgt.simulation.checks.setup_lines import beacon_failures, parameter_failures, setup_failures
 from tsgt.simulation.checks.station_events import event_failures

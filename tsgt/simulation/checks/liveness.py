@@ -8,7 +8,7 @@ import numpy as np
 
 from tsgt.estimation import usable
 from tsgt.model import MIN_PRISMS
-from tsgt.simulation.checks.apparent_poses import apparent_poses
+from tsgt.simulation.checks.poses import apparent_poses
 from tsgt.simulation.faults import FaultKind
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from tsgt.geometry.inertial import (
     Mounting,
     estimation_noise,
     fit_inertial_trajectory,
-    fixed_lag,
     smoother,
 )
+from tsgt.geometry.inertial.live import fixed_lag
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from harness.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.geometry import FloatArray, exp_so3
 from tsgt.geometry.inertial import InertialFixedLagSmoother, InertialSamples, sound_samples
-from tsgt.geometry.inertial.health import HOLD_S, MAX_AGE_S, STUCK_S, HealthMonitor
+from tsgt.geometry.inertial.live.health import HOLD_S, MAX_AGE_S, STUCK_S, HealthMonitor
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import butter, sosfilt
 
 from tsgt.geometry.inertial import InertialSamples
-from tsgt.geometry.inertial.rate_prediction import RotationPredictor
+from tsgt.geometry.inertial.live.rate_prediction import RotationPredictor
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray

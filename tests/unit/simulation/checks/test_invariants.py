@@ -18,9 +18,10 @@ from tsgt.config import ScenarioConfig
 from tsgt.model import Status
 from tsgt.recording import EventRecord, encode_line
 from tsgt.recording.journal import AcknowledgedRecord
-from tsgt.simulation.checks import check_invariants, pose_consistency
+from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.invariants import reading_mismatches
+from tsgt.simulation.checks.poses import consistency
 from tsgt.simulation.mission import JournalIndex
 from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
 
@@ -278,16 +279,16 @@ def test_overconfident_or_biased_poses_are_detected(
     result: MissionResult, part: slice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Poses with a sixteenth of the covariance, or all of them with an error of 10 mm."""
-    monkeypatch.setattr(pose_consistency, "_MIN_POSES", 300)
+    monkeypatch.setattr(consistency, "_MIN_POSES", 300)
     session = result.master_logs[0]
-    assert list(pose_consistency.distribution_failures(session, result)) == []
+    assert list(consistency.distribution_failures(session, result)) == []
     numbers = np.array(session._pose_numbers).reshape(-1, 52)
     if part.start:
         numbers[:, part] /= 16
     else:
         numbers[:, part] += 0.01
     session._pose_numbers = array("d", numbers.ravel())
-    assert list(pose_consistency.distribution_failures(session, result))
+    assert list(consistency.distribution_failures(session, result))
 
 
 def test_unrecorded_line_is_detected(result: MissionResult) -> None:

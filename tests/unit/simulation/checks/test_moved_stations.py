@@ -12,8 +12,8 @@ from harness.records import PARAMETERS, SECOND, START, measurement
 
 from tsgt.geometry import exp_so3, transform_from
 from tsgt.recording import EventRecord
-from tsgt.simulation.checks.apparent_poses import apparent_poses, misfit_tolerances
-from tsgt.simulation.checks.layout_events import WITHIN_S, layout_failures
+from tsgt.simulation.checks.poses.apparent import apparent_poses, misfit_tolerances
+from tsgt.simulation.checks.poses.layout_events import WITHIN_S, layout_failures
 from tsgt.simulation.checks.setup_lines import setup_failures
 from tsgt.simulation.mission import StationMove
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tsgt.config import ScenarioConfig, SimulatedImu, scenario_parameters
-from tsgt.simulation.checks.pose_consistency import max_median_rotation_rad, untold_displacements
+from tsgt.simulation.checks.poses.consistency import max_median_rotation_rad, untold_displacements
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ import pytest
 from harness.records import PARAMETERS, START, measurement
 
 from tsgt.geometry import quaternion_from_rotation
-from tsgt.simulation.checks.covariance_scale import mean_of_correlated, scale_failures
-from tsgt.simulation.checks.pose_lateness import lateness_failures
-from tsgt.simulation.checks.pose_rules import rule_failures
-from tsgt.simulation.checks.pose_twists import twist_failures
+from tsgt.simulation.checks.poses.covariance_scale import mean_of_correlated, scale_failures
+from tsgt.simulation.checks.poses.lateness import lateness_failures
+from tsgt.simulation.checks.poses.rules import rule_failures
+from tsgt.simulation.checks.poses.twists import twist_failures
 from tsgt.simulation.mission.run_log import ValidPoses
 
 if TYPE_CHECKING:

@@ -25,11 +25,11 @@ from tsgt.model import Status
 from tsgt.radio.classic import OK, MeasurementMessage
 from tsgt.recording import RecordingStatus, StationStatus, StatusRecord, encode_line
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
-from tsgt.simulation.checks.expected_poses import missing_poses
 from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.outstanding import outstanding_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
-from tsgt.simulation.checks.pose_ages import age_failures
+from tsgt.simulation.checks.poses.ages import age_failures
+from tsgt.simulation.checks.poses.expected import missing_poses
 from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
 from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.status_numbers import status_failures

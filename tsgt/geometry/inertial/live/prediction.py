@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tsgt.geometry.inertial.live.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.odometry import WheelsEstimate, covered_steps, linearise_odometry, rejected_steps
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
 from tsgt.geometry.inertial.query import strapdown
-from tsgt.geometry.inertial.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, TILT_DIM, concatenate_inertial_states
 from tsgt.geometry.rigid import IDENTITY, FloatArray, cross, matvec, skew
 from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
@@ -25,9 +25,9 @@ from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.geometry.trajectory.states import STATE_DIM, States
 
 if TYPE_CHECKING:
+    from tsgt.geometry.inertial.live.rate_prediction import PredictedRotation
     from tsgt.geometry.inertial.odometry import Odometry, OdometrySteps
     from tsgt.geometry.inertial.preintegration import Preintegrated
-    from tsgt.geometry.inertial.rate_prediction import PredictedRotation
     from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.inertial.states import Gravity, InertialStates, Mounting
     from tsgt.model import ImuNoise, MotionPrior

@@ -9,7 +9,7 @@ import numpy as np
 from tsgt.estimation import transform_of, usable
 from tsgt.geometry import invert, rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MIN_PRISMS
-from tsgt.simulation.checks.apparent_poses import apparent_poses
+from tsgt.simulation.checks.poses.apparent import apparent_poses
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -8,32 +8,30 @@ no pose: docs/explanation/imu.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.inertial.bordered import BorderedCholesky, factorise_bordered
 from tsgt.geometry.inertial.factors import (
     InertialAnchor,
     InertialEquations,
-    InertialFactors,
-    assemble_inertial,
 )
-from tsgt.geometry.inertial.health import HealthMonitor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
-from tsgt.geometry.inertial.known_rotation import KnownRotation
+from tsgt.geometry.inertial.live.health import HealthMonitor
+from tsgt.geometry.inertial.live.known_rotation import KnownRotation
+from tsgt.geometry.inertial.live.prediction import StrapdownPredictor
+from tsgt.geometry.inertial.live.rate_prediction import RotationPredictor
+from tsgt.geometry.inertial.live.window import KnotWindow, SolvedWindow, divided, factorise, propagate
+from tsgt.geometry.inertial.live.window_trajectory import POSE_DIM, WindowTrajectory
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
-from tsgt.geometry.inertial.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
-from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
-from tsgt.geometry.inertial.rate_prediction import RotationPredictor
+from tsgt.geometry.inertial.query import InertialTrajectory
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
 from tsgt.geometry.inertial.sensitivity import InertialSensitivity, Linearised, by_mounting, of_gyro_alone
 from tsgt.geometry.inertial.smoother import estimation_noise
 from tsgt.geometry.inertial.solver import (
-    MAX_BIAS_ROTATION_RAD,
     MAX_KNOT_SPACING_S,
     InertialSetup,
     InertialSolution,
@@ -42,8 +40,8 @@ from tsgt.geometry.inertial.solver import (
     inertial_knot_times,
     solve_inertial,
 )
-from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, Gravity, InertialStates, Mounting
-from tsgt.geometry.rigid import dot, log_so3
+from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, Gravity, Mounting
+from tsgt.geometry.rigid import log_so3
 from tsgt.geometry.trajectory.gauss_newton import (
     MAX_ITERATIONS,
     MIN_KNOT_SPACING_S,
@@ -61,17 +59,15 @@ from tsgt.geometry.trajectory.measurement_window import (
     is_below_step_tolerance,
     normalised_innovations,
 )
-from tsgt.geometry.trajectory.motion_prior import transition
-from tsgt.geometry.trajectory.states import States, concatenate_states
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
+    from tsgt.geometry.inertial.bordered import BorderedCholesky
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
+    from tsgt.geometry.trajectory.states import States
     from tsgt.model import ImuParameters, MotionPrior, OdometryParameters
 
 SEARCH_S = 40.0  # Longest stretch of measurements that the search over headings takes
@@ -92,13 +88,10 @@ MAX_ROTATION_SQUARES = 20.0
 """Of the rotation of a start against that from before, normalised, three components; 2 in 10,000 exceed it."""
 WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
-UNKNOWN_SIGMA = 100.0  # Of positions in m and rotations in rad, of which nothing is known
 SAMPLES_MARGIN_S = 0.5  # Before the oldest knot: the sample before a knot tells where the next one begins
 
 _DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0], 3)
 """Sigmas of position, rotation and velocity of the first state's error, once measurements determine it: as without an IMU."""
-
-_POSE_DIM = 6
 
 
 class InertialFixedLagSmoother(MeasurementWindow):
@@ -138,8 +131,8 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._samples: InertialSamples | None = None
         self._rotation_predictor = RotationPredictor()
         self._stale_from_s = np.inf  # Samples after this have arrived since the integration
-        self._window: _Window | None = None
-        self._solved: _Solved | None = None
+        self._window: KnotWindow | None = None
+        self._solved: SolvedWindow | None = None
         self._sensitivity: InertialSensitivity | None = None
         if gyro_only and mounting_factor is not None:
             mounting_factor = of_gyro_alone(mounting_factor)
@@ -190,7 +183,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         is older than 0.4 s at the time of a prediction; and when two prisms disagree with the samples within 1.2 s (one, three times
         in succession, where none other is measured). Stuck values and values beyond any range are left out. When prisms
         disagree, the trajectory is started anew from what comes after. Save for old samples, the reason stays for 2 s after its last cause; then, and
-        once there is a trajectory again, the IMU is to be believed. :class:`~tsgt.geometry.inertial.health.HealthMonitor` gives the
+        once there is a trajectory again, the IMU is to be believed. :class:`~tsgt.geometry.inertial.live.health.HealthMonitor` gives the
         grounds of the thresholds.
         """
         return self._health.reason
@@ -264,7 +257,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
                 driven = driven.select(driven.end_s > from_s - SAMPLES_MARGIN_S)
                 self._odometry = replace(self._odometry, samples=driven)
 
-    def predict(self, time_s: float, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
+    def predict(self, time_s: float, *, dim: int = POSE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all so far, and the (1, 6, 6) covariance of its pose.
 
         Beyond the newest knot the samples are integrated, and beyond the last one the motion prior goes on; the newest NIS
@@ -311,7 +304,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Return :meth:`trajectory`: the samples say themselves whether the robot stands."""
         return self.trajectory()
 
-    def common_at(self, time_s: float, *, dim: int = _POSE_DIM) -> FloatArray | None:
+    def common_at(self, time_s: float, *, dim: int = POSE_DIM) -> FloatArray | None:
         """Return the (1, 6, 6) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""
         if self._sensitivity is None:
             return None
@@ -393,7 +386,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         sigmas[:9] = _DIFFUSE_SIGMAS
         anchor = replace(prior, information=np.diag(sigmas**-2.0))
         samples = self._contiguous(knots.time_s)
-        self._window = _Window(knots, found.factors, samples.at(knots.time_s), anchor, samples)
+        self._window = KnotWindow(knots, found.factors, samples.at(knots.time_s), anchor, samples)
         # Without measurements before the horizon, which the start needed.
         held = searched.time_s >= self._horizon_s
         first = int(found.knot_index[held][0])
@@ -489,7 +482,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             )
 
         system = assembled(~is_new)
-        factor = _factorise(system)
+        factor = factorise(system)
 
         def solve_system(rhs: FloatArray) -> FloatArray:
             shared = np.zeros((len(system.corner_gradient), rhs.shape[2]))
@@ -509,7 +502,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             system.whitened[is_new], weights, knot_index[is_new], system.diagonal, system.gradient
         )
         for _ in range(MAX_STEPS):
-            factor = _factorise(system)
+            factor = factorise(system)
             step, shared = factor.solve(-system.gradient, -system.corner_gradient)
             gain = -float(np.vdot(step, system.gradient) + np.vdot(shared, system.corner_gradient))
             knots, gravity = knots.retract(step), gravity.retract(shared)
@@ -539,7 +532,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
         return self._converged
 
-    def _window_with(self, time_s: FloatArray) -> _Window:
+    def _window_with(self, time_s: FloatArray) -> KnotWindow:
         """Return the window with knots at measurement times that have none nearby, and with the samples that have arrived."""
         assert self._window is not None  # noqa: S101 (converged)
         window = self._window
@@ -551,47 +544,25 @@ class InertialFixedLagSmoother(MeasurementWindow):
                 times_s = np.sort(np.append(times_s, each))
         if added and times_s[-1] - old_s[-1] > MAX_KNOT_SPACING_S:
             newest = int(times_s.searchsorted(old_s[-1]))
-            times_s = np.concatenate([times_s[:newest], _divided(times_s[newest:])])
+            times_s = np.concatenate([times_s[:newest], divided(times_s[newest:])])
         samples = self._contiguous(times_s)
         # The states of the knots before; those of new ones are propagated below.
         nearest = old_s.searchsorted(times_s, side="right") - 1
         guess = replace(knots.select(nearest), time_s=times_s)
-        factors = self._factors_of(window, guess, samples)
-        for row in np.flatnonzero(old_s[nearest] != times_s).tolist():
-            _propagate(guess, row, factors, self._gravity, self._gyro_only)
-        self._stale_from_s = np.inf
-        if factors.odometry is not None:
-            factors = replace(factors, odometry=factors.odometry.with_slip(guess.wheels[:, 1]))
-        return _Window(guess, factors, samples.at(times_s), window.anchor, samples)
-
-    def _factors_of(
-        self, window: _Window, knots: InertialStates, samples: ContiguousSamples
-    ) -> InertialFactors:
-        """Factors between knots: those of the window where neither knots nor samples nor the gyro's bias have changed."""
-        old, old_s, times_s = window.factors, window.knots.time_s, knots.time_s
-        row = old_s.searchsorted(times_s[:-1])
-        row[row >= len(old)] = 0
-        kept = np.zeros(len(times_s) - 1, np.bool_)
-        if len(old):
-            kept = (old_s[row] == times_s[:-1]) & (old_s[row + 1] == times_s[1:])
-            kept &= times_s[1:] <= self._stale_from_s
-            moved = knots.gyro_bias[:-1] - old.preintegrated.gyro_bias[row]
-            kept &= np.sqrt(dot(moved, moved)) * np.diff(times_s) < MAX_BIAS_ROTATION_RAD
-        if kept.all():
-            return old.select(row)
-        changed = np.flatnonzero(~kept)
-        found = InertialFactors.between(
+        factors = window.factors_at(
+            guess,
             samples,
-            knots.select(changed),
-            times_s[changed + 1],
             self._noise,
+            stale_from_s=self._stale_from_s,
             gyro_only=self._gyro_only,
             odometry=self._odometry,
         )
-        if not kept.any():
-            return found
-        row[changed] = len(old) + np.arange(len(changed))
-        return old.joined(found).select(row)
+        for row in np.flatnonzero(old_s[nearest] != times_s).tolist():
+            propagate(guess, row, factors, self._gravity, self._gyro_only)
+        self._stale_from_s = np.inf
+        if factors.odometry is not None:
+            factors = replace(factors, odometry=factors.odometry.with_slip(guess.wheels[:, 1]))
+        return KnotWindow(guess, factors, samples.at(times_s), window.anchor, samples)
 
     def _accept(
         self,
@@ -611,7 +582,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._window.anchor,
             self._anchor_displacement,
         )
-        self._solved = _Solved(self._window, gravity, factor, linearised)
+        self._solved = SolvedWindow(self._window, gravity, factor, linearised)
         self._gravity, self._trajectory, self._displacement = gravity, None, None
         self.residuals_m = found.linearised.residuals_m
         covariance = factor.last_covariance()
@@ -654,7 +625,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._gravity,
             rejectable=np.ones(int(is_past.sum()), np.bool_),
         )
-        factor = _factorise(system)
+        factor = factorise(system)
         step, shared = factor.solve(-system.gradient, -system.corner_gradient)
         if self._sensitivity is not None:
             linearised = system.linearised, system.weights, knot_index[is_past]
@@ -669,149 +640,12 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._window = replace(window.select(slice(first, None)), anchor=anchor)
 
 
-@dataclass(frozen=True, slots=True)
-class _Window:
-    """Knots, the factors between them, and the anchor prior on the first."""
-
-    knots: InertialStates
-    factors: InertialFactors
-    kinematics: tuple[FloatArray, FloatArray]  # Angular rate and specific force at the knots
-    anchor: InertialAnchor
-    samples: ContiguousSamples
-
-    def select(self, rows: slice) -> _Window:
-        """Return some knots, all from the first or all up to the last."""
-        steps = slice(rows.start, None if rows.stop is None else rows.stop - 1)
-        kinematics = self.kinematics[0][rows], self.kinematics[1][rows]
-        return _Window(
-            self.knots.select(rows), self.factors.select(steps), kinematics, self.anchor, self.samples
-        )
-
-    def assemble(
-        self,
-        observations: Observations,
-        knot_index: NDArray[np.intp],
-        knots: InertialStates,
-        gravity: Gravity,
-        *,
-        rejectable: NDArray[np.bool_],
-        active: NDArray[np.bool_] | None = None,
-    ) -> InertialEquations:
-        """Assemble the normal equations at states of the knots."""
-        return assemble_inertial(
-            observations,
-            knot_index,
-            knots,
-            self.kinematics,
-            gravity,
-            self.factors,
-            self.anchor,
-            active=active,
-            rejectable=rejectable,
-        )
-
-
 def _is_consistent(start: InertialSolution) -> bool:
     """Whether measurements, samples and priors agree in a start, whose position, velocity and rotation are free."""
     outliers = start.squared_distances >= OUTLIER_THRESHOLD**2
     _, loss = robust_loss(start.squared_distances[outliers])
     freedom = 3 * np.count_nonzero(~outliers) - len(_DIFFUSE_SIGMAS)
     return start.cost - float(loss.sum()) < MAX_START_COST * float(freedom)
-
-
-class _Solved(NamedTuple):
-    """A solution of the window."""
-
-    window: _Window  # With the solution's knots
-    gravity: Gravity
-    factor: BorderedCholesky
-    linearised: Linearised
-
-
-@dataclass(frozen=True, slots=True)
-class WindowTrajectory:
-    """The trajectory of a window, and its prediction beyond the newest knot."""
-
-    inside: InertialTrajectory
-    predict: Callable[[float, int], tuple[States, FloatArray]]
-    predicted_common: Callable[[float, int], FloatArray]
-
-    def at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
-        """Return states of the reference point at N times, and the (N, 6, 6) covariance of poses.
-
-        Before the first knot, where nothing is known, the pose is that of the knot, with a covariance that says so.
-        """
-        beyond = self._beyond(time_s)
-        parts = []
-        if not beyond.all() or not len(time_s):
-            first_s = self.inside.knots.time_s[0]
-            states, covariance = self.inside.at(np.maximum(time_s[~beyond], first_s), dim=dim)
-            before = time_s[~beyond] < first_s
-            covariance[before] += UNKNOWN_SIGMA**2 * np.eye(dim)
-            parts.append((replace(states, time_s=time_s[~beyond]), covariance))
-        parts += [self.predict(each, dim) for each in time_s[beyond].tolist()]
-        if len(parts) == 1:
-            return parts[0]
-        order = _order(beyond)
-        states = concatenate_states([each for each, _ in parts])
-        return states.select(order), np.concatenate([each for _, each in parts])[order]
-
-    def common_at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> FloatArray | None:
-        """Return the (N, 6, 6) covariance that the set-up's uncertainty adds; None: unknown."""
-        if self.inside.displacement is None:
-            return None
-        beyond = self._beyond(time_s)
-        within_s = np.maximum(time_s[~beyond], self.inside.knots.time_s[0])
-        parts = [self.inside.common_at(within_s, dim=dim)] if len(within_s) else []
-        parts += [self.predicted_common(each, dim) for each in time_s[beyond].tolist()]
-        known = [each for each in parts if each is not None]
-        return np.concatenate(known)[_order(beyond)] if known else np.empty((0, dim, dim))
-
-    def _beyond(self, time_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether times are predicted; a single knot has no inside."""
-        knots_s = self.inside.knots.time_s
-        return time_s > knots_s[-1] if len(knots_s) > 1 else np.ones(len(time_s), np.bool_)
-
-
-def _order(beyond: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Order of time of rows inside, then rows beyond."""
-    return np.argsort(np.concatenate([np.flatnonzero(~beyond), np.flatnonzero(beyond)]))
-
-
-def _propagate(
-    states: InertialStates, row: int, factors: InertialFactors, gravity: Gravity, prior: MotionPrior | None
-) -> None:
-    """Set a state, in place, to what follows from the one before."""
-    start, motion = states.select(slice(row - 1, row)), factors.preintegrated.select(slice(row - 1, row))
-    if prior is None:
-        found = strapdown(start, gravity, motion)
-        states.position[row] = found.position[0]
-        states.rotation[row] = found.rotation[0]
-        states.velocity[row] = found.velocity[0]
-        states.bias_or_acceleration[row] = start.bias_or_acceleration[0]
-    else:
-        phi = transition(motion.duration_s, np.array(prior.acceleration_correlation_time_s))[0]
-        axes = np.concatenate([start.position, start.velocity, start.bias_or_acceleration])
-        moved = phi @ axes
-        states.position[row], states.velocity[row], states.bias_or_acceleration[row] = moved
-        states.rotation[row] = start.rotation[0] @ motion.rotation[0]
-    states.gyro_bias[row] = start.gyro_bias[0]
-    if factors.odometry is not None:
-        states.wheels[row] = factors.odometry.kept[row - 1] * start.wheels[0]
-
-
-def _factorise(system: InertialEquations) -> BorderedCholesky:
-    return factorise_bordered(system.diagonal, system.off_diagonal, system.border, system.corner)
-
-
-def _divided(times_s: FloatArray) -> FloatArray:
-    """Insert times so that none is further than the largest spacing from the next."""
-    steps = np.ceil(np.diff(times_s) / MAX_KNOT_SPACING_S - 1e-9).astype(np.int64)
-    parts = [
-        times_s[i] + (times_s[i + 1] - times_s[i]) * np.arange(count) / count
-        for i, count in enumerate(steps.tolist())
-    ]
-    return np.concatenate([*parts, times_s[-1:]])
 
 
 def _path_m(observations: Observations) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from tsgt.estimation import build_tracks, centroid_at_point, centroid_m, transform_of, usable
 from tsgt.geometry import invert, log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MIN_PRISMS
-from tsgt.simulation.checks.apparent_poses import apparent_poses, misfit_tolerances
+from tsgt.simulation.checks.poses.apparent import apparent_poses, misfit_tolerances
 from tsgt.simulation.faults import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ import numpy as np
 
 from tsgt.config import FrameWatchConfig
 from tsgt.model import MIN_PRISMS
-from tsgt.simulation.checks.apparent_poses import apparent_poses, has_moves
-from tsgt.simulation.checks.expected_poses import measured_epochs
+from tsgt.simulation.checks.poses.apparent import apparent_poses, has_moves
+from tsgt.simulation.checks.poses.expected import measured_epochs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

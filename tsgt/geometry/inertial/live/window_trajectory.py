@@ -1,0 +1,72 @@
+"""The trajectory of a fixed-lag smoother's window at any time: between knots, and predicted beyond the newest one. Sans-I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsgt.geometry.trajectory.states import States, concatenate_states
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from tsgt.geometry.inertial.query import InertialTrajectory
+    from tsgt.geometry.rigid import FloatArray
+
+UNKNOWN_SIGMA = 100.0  # Of positions in m and rotations in rad, of which nothing is known
+
+POSE_DIM = 6
+
+
+@dataclass(frozen=True, slots=True)
+class WindowTrajectory:
+    """The trajectory of a window, and its prediction beyond the newest knot."""
+
+    inside: InertialTrajectory
+    predict: Callable[[float, int], tuple[States, FloatArray]]
+    predicted_common: Callable[[float, int], FloatArray]
+
+    def at(self, time_s: FloatArray, *, dim: int = POSE_DIM) -> tuple[States, FloatArray]:
+        """Return states of the reference point at N times, and the (N, 6, 6) covariance of poses.
+
+        Before the first knot, where nothing is known, the pose is that of the knot, with a covariance that says so.
+        """
+        beyond = self._beyond(time_s)
+        parts = []
+        if not beyond.all() or not len(time_s):
+            first_s = self.inside.knots.time_s[0]
+            states, covariance = self.inside.at(np.maximum(time_s[~beyond], first_s), dim=dim)
+            before = time_s[~beyond] < first_s
+            covariance[before] += UNKNOWN_SIGMA**2 * np.eye(dim)
+            parts.append((replace(states, time_s=time_s[~beyond]), covariance))
+        parts += [self.predict(each, dim) for each in time_s[beyond].tolist()]
+        if len(parts) == 1:
+            return parts[0]
+        order = _order(beyond)
+        states = concatenate_states([each for each, _ in parts])
+        return states.select(order), np.concatenate([each for _, each in parts])[order]
+
+    def common_at(self, time_s: FloatArray, *, dim: int = POSE_DIM) -> FloatArray | None:
+        """Return the (N, 6, 6) covariance that the set-up's uncertainty adds; None: unknown."""
+        if self.inside.displacement is None:
+            return None
+        beyond = self._beyond(time_s)
+        within_s = np.maximum(time_s[~beyond], self.inside.knots.time_s[0])
+        parts = [self.inside.common_at(within_s, dim=dim)] if len(within_s) else []
+        parts += [self.predicted_common(each, dim) for each in time_s[beyond].tolist()]
+        known = [each for each in parts if each is not None]
+        return np.concatenate(known)[_order(beyond)] if known else np.empty((0, dim, dim))
+
+    def _beyond(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """Whether times are predicted; a single knot has no inside."""
+        knots_s = self.inside.knots.time_s
+        return time_s > knots_s[-1] if len(knots_s) > 1 else np.ones(len(time_s), np.bool_)
+
+
+def _order(beyond: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Order of time of rows inside, then rows beyond."""
+    return np.argsort(np.concatenate([np.flatnonzero(~beyond), np.flatnonzero(beyond)]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -48,20 +49,30 @@ def status_failures(master_log: MasterLog, indices: Mapping[int, JournalIndex]) 
             at_s = (stamp_ns - master_log.unix_at_zero_ns) / 1e9
             yield f"the status after that of {at_s:.3f} s comes {(next_ns - stamp_ns) / 1e9:.3f} s later"
             break
-    for at_s, station, published, usable_count, problem in _stations(master_log):
-        if problem or (
-            problem := _problem(station, published, usable_count, at_s, master_log.unix_at_zero_ns)
-        ):
+    for at_s, station, published, problem in _stations(master_log):
+        if problem or (problem := _problem(station, published, at_s, master_log.unix_at_zero_ns)):
             yield f"status at {at_s:.3f} s: {problem}"
             return
 
 
-def _stations(
-    master_log: MasterLog,
-) -> Iterator[tuple[float, StationStatus, list[PolarMeasurement], int, str]]:
+@dataclass(slots=True)
+class _Published:
+    """What has been published of a station."""
+
+    measurements: list[PolarMeasurement] = field(default_factory=list)
+    usable_count: int = 0
+    newest: PolarMeasurement | None = None  # by time; an older one may arrive late
+
+    def add(self, measurement: PolarMeasurement) -> None:
+        self.measurements.append(measurement)
+        self.usable_count += usable(measurement)
+        if self.newest is None or measurement.stamp_ns > self.newest.stamp_ns:
+            self.newest = measurement
+
+
+def _stations(master_log: MasterLog) -> Iterator[tuple[float, StationStatus, _Published, str]]:
     """Yield for each status and station its time, what had been published of it, and what is wrong with the poses' counts."""
-    by_station: dict[int, list[PolarMeasurement]] = defaultdict(list)
-    usable_counts: dict[int, int] = defaultdict(int)
+    by_station: dict[int, _Published] = defaultdict(_Published)
     seen = 0
     for status, (before, latest) in zip(master_log.statuses, master_log.counts_at_status, strict=True):
         problem = ""
@@ -70,33 +81,32 @@ def _stations(
             if not least <= stated <= most:
                 problem = f"{stated} {name}, the stream has {least} to {most}"
         for measurement in master_log.measurements[seen : latest.measurements]:
-            by_station[measurement.station].append(measurement)
-            usable_counts[measurement.station] += usable(measurement)
+            by_station[measurement.station].add(measurement)
         seen = latest.measurements
         at_s = (status.stamp_ns - master_log.unix_at_zero_ns) / 1e9
         for station in status.stations:
-            yield at_s, station, by_station[station.id], usable_counts[station.id], problem
+            yield at_s, station, by_station[station.id], problem
 
 
 def _problem(
     station: StationStatus,
-    published: list[PolarMeasurement],
-    usable_count: int,
+    published: _Published,
     at_s: float,
     unix_at_zero_ns: int,
 ) -> str:
     """Return what is wrong with the status of a station; empty: nothing."""
     now_ns = round(at_s * 1e9) + unix_at_zero_ns
     expected: list[tuple[str, float | str | None, tuple[float | str | None, ...]]] = [
-        ("measurements", station.measurements, (len(published),)),
-        ("usable measurements", station.usable, (usable_count,)),
+        ("measurements", station.measurements, (len(published.measurements),)),
+        ("usable measurements", station.usable, (published.usable_count,)),
     ]
-    if published:
+    if published.newest is not None:
+        first, last = published.measurements[0], published.measurements[-1]
         # The newest by time, or by arrival: an older one may arrive late, and a station's clock may have been stepped.
-        newest = (max(published, key=lambda m: m.stamp_ns), published[-1])
-        span_ns = min(RATE_WINDOW_NS, max(now_ns - published[0].received_ns, MIN_RATE_SPAN_NS))
+        newest = (published.newest, last)
+        span_ns = min(RATE_WINDOW_NS, max(now_ns - first.received_ns, MIN_RATE_SPAN_NS))
         count = 0
-        for measurement in reversed(published):
+        for measurement in reversed(published.measurements):
             if measurement.received_ns <= now_ns - RATE_WINDOW_NS:
                 break
             count += 1
@@ -107,7 +117,7 @@ def _problem(
             ("bound of the stamp", station.stamp_bound_ns, tuple(m.stamp_bound_ns for m in newest)),
         ]
         locked = station.status is not None and station.status in LOCKED
-        since_s = (now_ns - published[-1].received_ns) / 1e9
+        since_s = (now_ns - last.received_ns) / 1e9
         if station.locked != locked:
             return f"station {station.id}: locked {station.locked} with the status {station.status}"
         if (
@@ -130,10 +140,10 @@ def _equal(one: float | str | None, other: float | str | None) -> bool:
 
 def _offset_errors(master_log: MasterLog, indices: Mapping[int, JournalIndex]) -> Iterator[float]:
     """Yield errors of clock offsets in units of their bounds, where a fresh measurement was stamped with such an offset."""
-    for at_s, station, published, _, _ in _stations(master_log):
-        if station.clock_offset_ns is None or station.clock_bound_ns is None or not published:
+    for at_s, station, published, _ in _stations(master_log):
+        if station.clock_offset_ns is None or station.clock_bound_ns is None or not published.measurements:
             continue
-        newest = published[-1]
+        newest = published.measurements[-1]
         journalled = indices[station.id].find(newest)
         if (
             journalled is not None

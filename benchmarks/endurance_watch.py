@@ -56,9 +56,9 @@ class Stream:
     longest_pause_s
         The longest time between two lines from the first pose on.
     epochs_ns
-        Of all poses, by kind, as they came.
+        Of all poses, by kind and delay, as they came.
     valid, reasons
-        How many poses were valid, by kind, and why others were not.
+        How many poses were valid, by kind and delay, and why others were not.
     ages_s
         By station: from the stamp of each measurement to its arrival here.
     late
@@ -86,8 +86,10 @@ class Stream:
         match line["type"]:
             case "pose":
                 self.first_s = self.first_s or now_s
-                self.epochs_ns[line["kind"]].append(line["stamp_ns"])
-                self.valid[line["kind"]] += line["valid"]
+                delay_s = line["delay_s"]
+                series = line["kind"] if delay_s is None else f"{line['kind']}_{delay_s:g}s"
+                self.epochs_ns[series].append(line["stamp_ns"])
+                self.valid[series] += line["valid"]
                 self.reasons[line["reason"]] += not line["valid"]
             case "measurement":
                 self.ages_s[line["station"]].append((time.time_ns() - line["stamp_ns"]) / 1e9)
@@ -96,10 +98,10 @@ class Stream:
             case "event" if line["event"] == "lines_lost":
                 self.lost += line["count"]
 
-    def missing_epochs(self, kind: str, period_ns: int) -> int:
-        """Return how many epochs between the first pose of a kind and the last have none."""
+    def missing_epochs(self, series: str, period_ns: int) -> int:
+        """Return how many epochs between the first pose of a series and the last have none."""
         return sum(
-            max(0, (after - before) // period_ns - 1) for before, after in pairwise(self.epochs_ns[kind])
+            max(0, (after - before) // period_ns - 1) for before, after in pairwise(self.epochs_ns[series])
         )
 
 

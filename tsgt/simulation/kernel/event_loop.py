@@ -75,7 +75,7 @@ class VirtualEventLoop(asyncio.SelectorEventLoop):
             timeline, time_frozen=lambda: self._running_in_executor > 0
         )
         super().__init__(selector)
-        selector.attach(self._ready, isolated=isolated)
+        selector.attach(self._ready, self._suspended, isolated=isolated)
 
     def time(self) -> float:
         """Seconds since the timeline's zero; exact to the nanosecond for the first 26 days."""
@@ -316,13 +316,15 @@ class _TimeJumpSelector(selectors.DefaultSelector):
         self._timeline = timeline
         self._time_frozen = time_frozen
         self._ready: Sized = ()
+        self._suspended: Sequence[_Suspension] = ()
         self._isolated = False
         self._connected_fds: set[int] = set()
         self._skipped_polls = 0
 
-    def attach(self, ready: Sized, *, isolated: bool) -> None:
+    def attach(self, ready: Sized, suspended: Sequence[_Suspension], *, isolated: bool) -> None:
         """Connect to the loop's queue of ready callbacks; files registered so far (wake-up sockets) do not count as connections."""
         self._ready = ready
+        self._suspended = suspended
         self._isolated = isolated
         self._connected_fds.clear()
 
@@ -361,7 +363,16 @@ class _TimeJumpSelector(selectors.DefaultSelector):
         if self._isolated and not self._connected_fds and self._skipped_polls < _IDLE_POLL_INTERVAL:
             return []
         self._skipped_polls = 0
-        return super().select(0)
+        events = super().select(0)
+        # A socket of a suspended computer stays ready until its callback runs: it must not keep time from advancing.
+        return [each for each in events if not self._is_held(each[0].data)] if self._suspended else events
+
+    def _is_held(self, handles: object) -> bool:
+        """Whether callbacks of a file, asyncio's pair of reader and writer, are held back."""
+        contexts = (
+            [each._context for each in handles if each is not None] if isinstance(handles, tuple) else []
+        )
+        return any(suspension.belongs(each) for suspension in self._suspended for each in contexts)
 
 
 def _is_listening(fd: int) -> bool:

@@ -111,9 +111,6 @@ def test_client_on_another_channel_or_prism_loses_nothing(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.skip(
-    reason="virtual time stands still after the resume since the event loop does less for each callback"
-)
 def test_suspended_master_restarts(tmp_path: Path) -> None:
     """No pose and no time of its old timeline is published after it resumes; stations deliver what they measured meanwhile."""
 

@@ -369,9 +369,8 @@ class _TimeJumpSelector(selectors.DefaultSelector):
 
     def _is_held(self, handles: object) -> bool:
         """Whether callbacks of a file, asyncio's pair of reader and writer, are held back."""
-        contexts = (
-            [each._context for each in handles if each is not None] if isinstance(handles, tuple) else []
-        )
+        pair = handles if isinstance(handles, tuple) else ()
+        contexts = [each._context for each in pair if each is not None]  # noqa: SLF001 (asyncio's own)
         return any(suspension.belongs(each) for suspension in self._suspended for each in contexts)
 
 

@@ -275,6 +275,25 @@ def test_start_that_fails_after_the_window_has_moved_on() -> None:
     assert len(live.window.residuals_m) == len(live.window.observations)
 
 
+def test_no_start_when_all_of_the_window_is_wrong() -> None:
+    """After an outage the only measurement is of a wrong prism: what came before it tells a trajectory, but none till now."""
+    observations = measurements()
+    before = observations.select(observations.time_s < 4.0)
+    live = Live()
+    live.window.update(before)  # without samples there is no start yet
+    live.window.marginalise_before(5.0)
+    live.sample_until(6.0)
+    row = int(np.searchsorted(observations.time_s, 5.5))
+    wrong = observations.select(slice(row, row + 1))
+    live.window.update(replace(wrong, points_m=wrong.points_m + 1.0))
+    assert not live.window.converged
+    live.measure(observations.select(slice(row + 1, None)))
+    assert live.window.converged
+    state, _ = live.window.predict(7.0)
+    position, rotation = DRIVE.pose_at(np.array([7.0]))
+    assert np.linalg.norm(state.position - position - rotation @ CENTROID) < 0.05
+
+
 def test_window_does_not_grow() -> None:
     """Numbers of measurements, knots and samples are bounded."""
     window = tracked().window

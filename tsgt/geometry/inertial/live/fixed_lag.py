@@ -393,6 +393,8 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._anchor_displacement = None
         outliers = self._accept(self._mounted(searched), found.knot_index, found.gravity, found.factor, found)
         outliers = outliers[held]
+        if outliers.all():  # a single one, say, after an outage: whether the start still holds is not known
+            raise GeometryError("none of the newest measurements agrees with the trajectory")
         self._converged &= consistent and self._keeps_rotation()
         if self._converged:
             if first > 0:

@@ -23,10 +23,11 @@ def recording_failures(master_log: MasterLog) -> Iterator[str]:
 
     The recording of a master that was killed may end early, with half a line.
     """
-    path = master_log.recording()
+    path, hashes = master_log.recording(), master_log.line_hashes
     if path is None:
+        if hashes and not master_log.crashed:
+            yield "the master published records but has no recording"
         return
-    hashes = master_log.line_hashes
     count = 0
     for line in _streamed_lines(path):
         if count == len(hashes) or hash(line) != hashes[count]:

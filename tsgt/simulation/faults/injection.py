@@ -41,6 +41,7 @@ _MASTER_STEP_S: Final = (-30.0, 30.0)
 _CLASSIC_LENGTHS = frozenset({2, 3, 9, 34})
 _LINE_FAULTS = tuple(fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.WRONG_DIGIT))
 _MAX_LOOP_ROUNDS = 40
+_RESUMED_S = 1.0  # Steps in which a resume is waited for
 _RELOCK_CHECKS_S: Final = (2.0, 4.0, 6.0)
 
 
@@ -278,13 +279,16 @@ async def _crash(mission: Mission, fault: Fault, rng: np.random.Generator) -> No
 async def _torn_write(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     torn = asyncio.Event()
     loop = asyncio.get_running_loop()
-    if (writes := mission.computers[_computer_name(fault)].disk_writer) is None:
+    computer = mission.computers[_computer_name(fault)]
+    if (writes := computer.disk_writer) is None:
         return
     writes.tear_next_write(rng.random(), partial(loop.call_soon_threadsafe, torn.set))
     with suppress(TimeoutError):
         async with asyncio.timeout(10):
             await torn.wait()
-    await mission.crash(_computer_name(fault), down_s=fault.duration_s)
+    while computer.is_suspended:  # noqa: ASYNC110 (waits in virtual time)
+        await asyncio.sleep(_RESUMED_S)
+    await mission.crash(computer.name, down_s=fault.duration_s)
 
 
 async def _disk(error: int, mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:

@@ -74,6 +74,15 @@ class Computer:
         self.disk_writer = DiskWriter(self.disk)
         return self.disk_writer
 
+    @property
+    def failure(self) -> BaseException | None:
+        """The error that the daemon has ended with; None: it runs or was stopped, or was killed during a write."""
+        task = self.task
+        if task is None or not task.done() or task.cancelled():
+            return None
+        error = task.exception()
+        return None if error is None or _is_killed(error) else error
+
     def start(self, daemon: Coroutine[None, None, None]) -> None:
         """Start a daemon."""
         context = copy_context()

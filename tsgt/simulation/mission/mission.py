@@ -267,19 +267,14 @@ class Mission:
         while self.now_s < time_s:
             self._positions_m[MASTER] = tuple(self.world.pose_at(np.array([self.now_s]))[0, :3, 3].tolist())
             step_s = min(1.0, time_s - self.now_s)
-            tasks = [computer.task for computer in self.computers.values() if computer.task is not None]
-            if not tasks:  # all daemons are down
+            computers = self.computers.values()
+            running = [each.task for each in computers if each.task is not None and not each.task.done()]
+            if running:
+                await asyncio.wait(running, timeout=step_s, return_when=asyncio.FIRST_EXCEPTION)
+            else:  # all daemons are down
                 await asyncio.sleep(step_s)
-                continue
-            ended, _ = await asyncio.wait(tasks, timeout=step_s, return_when=asyncio.FIRST_EXCEPTION)
-            errors = [
-                error
-                for task in ended
-                if not task.cancelled() and isinstance(error := task.exception(), Exception)
-            ]
-            if errors:
-                raise ExceptionGroup("a daemon has ended", errors)
-            await asyncio.sleep(0)  # lets the caller of a kill remove its task
+            if failures := [error for each in computers if (error := each.failure) is not None]:
+                raise BaseExceptionGroup("a daemon has ended", failures)
 
     async def sleep_until(self, time_s: float) -> None:
         """Sleep until a true time in s from the start."""

@@ -261,8 +261,13 @@ class MasterLog:
         )
 
     def recording(self) -> Path | None:
-        """Return the recording; None: the master ended before it had one."""
-        return next(iter(sorted(self.folder.glob("*.jsonl"))), None)
+        """Return the recording; None: the master ended before it had one with a whole header."""
+        return next((path for path in sorted(self.folder.glob("*.jsonl")) if _has_header(path)), None)
+
+
+def _has_header(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.readline().endswith(b"\n")
 
 
 @dataclass(slots=True)

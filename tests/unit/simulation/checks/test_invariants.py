@@ -296,3 +296,13 @@ def test_unrecorded_line_is_detected(result: MissionResult) -> None:
     planted = EventRecord(stamp_ns=1, event="planted", message="not in the recording")
     result.master_logs[0].observe(planted, encode_line(planted))
     assert _checks(result) == {"recording", "replay"}
+
+
+@pytest.mark.parametrize("crashed", [False, True])
+def test_recording_without_a_header(result: MissionResult, tmp_path: Path, *, crashed: bool) -> None:
+    """A master that was killed as it wrote it leaves none; any other one must have a recording."""
+    session = result.master_logs[0]
+    session.folder, session.crashed = tmp_path, crashed
+    (tmp_path / "master.jsonl").write_bytes(b'{"type":"recor')
+    found = check_invariants(result)
+    assert any("has no recording" in each.detail for each in found) != crashed

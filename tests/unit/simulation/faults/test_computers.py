@@ -9,7 +9,7 @@ import pytest
 from harness.missions import SUPERFRAME, run_mission
 
 from tsgt.simulation.checks import check_invariants
-from tsgt.simulation.faults import FIELD_DAY_FAULTS, FaultKind, parse_faults
+from tsgt.simulation.faults import FIELD_DAY_FAULTS, Fault, FaultKind, inject_fault, parse_faults
 from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
@@ -79,6 +79,28 @@ def test_suspended_computer_is_neither_rebooted_nor_killed(tmp_path: Path) -> No
 
     result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=10.0)
     assert len(result.station_logs[2].journals) == 2  # the client restarts when it is resumed
+
+
+@pytest.mark.slow
+def test_write_that_is_torn_as_a_computer_resumes(tmp_path: Path) -> None:
+    """The client that began anew after the suspension died of it, and is restarted; time goes on meanwhile."""
+
+    async def suspend(mission: Mission) -> None:
+        await mission.sleep_until(4.0)
+        torn = Fault(4.0, FaultKind.TORN_WRITE, 2, 1.0, 1)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(mission.suspend(2, 14.0))
+            group.create_task(inject_fault(mission, torn))
+
+    result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=26.0)
+    assert check_invariants(result, replay=False) == []
+    assert (
+        sum(
+            m.station == 2 and m.stamp_ns - result.start_ns > 22e9
+            for m in result.master_logs[-1].measurements
+        )
+        > 3
+    )
 
 
 @pytest.mark.slow

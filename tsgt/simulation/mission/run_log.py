@@ -262,10 +262,10 @@ class MasterLog:
 
     def recording(self) -> Path | None:
         """Return the recording; None: the master ended before it had one with a whole header."""
-        return next((path for path in sorted(self.folder.glob("*.jsonl")) if _has_header(path)), None)
+        return next((path for path in sorted(self.folder.glob("*.jsonl")) if _has_first_line(path)), None)
 
 
-def _has_header(path: Path) -> bool:
+def _has_first_line(path: Path) -> bool:
     with path.open("rb") as file:
         return file.readline().endswith(b"\n")
 

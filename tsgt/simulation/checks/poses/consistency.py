@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -73,9 +74,11 @@ def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]
     """Compare each valid pose of the estimator ``continuous`` with the truth and its covariance (NEES)."""
     poses = master_log.valid_poses()
     poses = poses.select((poses.series != "interpolated") & ~rolls_over_unseen(poses, master_log, result))
+    untold = untold_displacements(poses, master_log, result)
+    poses = replace(poses, covariance=displaced_covariance(poses.covariance, untold, result.parameters))
     errors, nees, misfits = _errors(poses, master_log, result)
     error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
-    limits = _STATE_TOLERANCE + untold_displacements(poses, master_log, result) + misfits
+    limits = _STATE_TOLERANCE + untold + misfits
     for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms > limits).any(axis=1)).tolist():
         yield (
             f"{poses.series[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "
@@ -116,6 +119,15 @@ def untold_displacements(
     knocks = np.searchsorted(np.sort(result.knocks_s), at_s).astype(np.float64)
     displaced: NDArray[np.float64] = knocks[:, None] * each
     return displaced
+
+
+def displaced_covariance(
+    covariance: NDArray[np.float64], untold: NDArray[np.float64], parameters: Parameters
+) -> NDArray[np.float64]:
+    """Add to covariances, (N, 6, 6), what :func:`untold_displacements` gives: the error of a long prediction is far larger than that."""
+    arm_m = float(np.linalg.norm(centroid_at_point(parameters)))
+    sigmas = np.stack([untold[:, 0] + arm_m * untold[:, 1], untold[:, 1]], axis=1).repeat(3, axis=1)
+    return np.asarray(covariance + sigmas[:, None] ** 2 * np.eye(6))
 
 
 def distribution_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:

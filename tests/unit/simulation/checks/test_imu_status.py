@@ -1,0 +1,33 @@
+"""What status records say of the IMU, against the truth."""
+
+from __future__ import annotations
+
+from array import array
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tsgt.simulation.checks.imu_samples import imu_status_failures
+from tsgt.simulation.mission.run_log import PublishedCounts
+
+STATUSES = 12
+
+
+@pytest.mark.parametrize(
+    ("error_radps", "valid_poses", "failures"), [(0.02, 5, 1), (0.02, 0, 0), (0.005, 5, 0)]
+)
+def test_stated_gyro_bias(error_radps: float, valid_poses: int, failures: int) -> None:
+    """It is wrong if it is far from the true one while there are valid poses; before, it need not be known."""
+    status = SimpleNamespace(imu=SimpleNamespace(use="used", gyro_bias_radps=(error_radps, 0.0, 0.0)))
+    counts = [PublishedCounts(0, 10 * n, valid_poses * n) for n in range(1, STATUSES + 1)]
+    log = SimpleNamespace(
+        statuses=[status] * STATUSES,
+        imu_uses_at_status=["used"] * STATUSES,
+        counts_at_status=[(each, each) for each in counts],
+        jumps_m=array("d"),
+    )
+    truth = SimpleNamespace(gyro_bias_radps=np.zeros((1, 3)))
+    result: Any = SimpleNamespace(master_logs=[log], imu=SimpleNamespace(truth=truth))
+    assert len(list(imu_status_failures(result))) == failures

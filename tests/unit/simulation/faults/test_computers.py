@@ -6,24 +6,15 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions import run_linear_drive
 
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.faults import FIELD_DAY_FAULTS, Fault, FaultKind, inject_fault, parse_faults
-from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tsgt.config import ScenarioConfig
     from tsgt.simulation.mission import Mission
-
-
-def _linear() -> ScenarioConfig:
-    scenario = find_scenario("dynamic")
-    return scenario.model_copy(
-        update={"pipeline": scenario.pipeline.model_copy(update={"estimator": "linear"})}
-    )
 
 
 def test_kinds_of_field_days_come_by_name_only() -> None:
@@ -40,7 +31,7 @@ def test_measurements_around_a_suspension_have_their_true_times(tmp_path: Path) 
         await mission.sleep_until(12.0)
         await mission.suspend(2, 8.0)
 
-    result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=32.0)
+    result = run_linear_drive(tmp_path, suspend, 32.0)
     assert check_invariants(result, replay=False) == []
     late = [m for m in result.master_logs[-1].measurements if m.station == 2 and m.received_ns is not None]
     assert sum((m.stamp_ns - result.start_ns) / 1e9 > 21.0 for m in late) > 15
@@ -60,7 +51,7 @@ def test_measurements_wait_for_a_stalled_disk(tmp_path: Path) -> None:
             queued.append(mission.station_logs[station].statuses[-1].queued or 0)
             mission.start_station(station)
 
-    result = run_mission(tmp_path, _linear(), script=stall, protocol=SUPERFRAME, duration_s=24.0)
+    result = run_linear_drive(tmp_path, stall, 24.0)
     assert check_invariants(result) == []
     assert min(queued) >= 12
 
@@ -77,7 +68,7 @@ def test_suspended_computer_is_neither_rebooted_nor_killed(tmp_path: Path) -> No
             await mission.sleep_until(6.0)
             await mission.crash("station2", down_s=1.0)
 
-    result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=10.0)
+    result = run_linear_drive(tmp_path, suspend, 10.0)
     assert len(result.station_logs[2].journals) == 2  # the client restarts when it is resumed
 
 
@@ -92,7 +83,7 @@ def test_write_that_is_torn_as_a_computer_resumes(tmp_path: Path) -> None:
             group.create_task(mission.suspend(2, 14.0))
             group.create_task(inject_fault(mission, torn))
 
-    result = run_mission(tmp_path, _linear(), script=suspend, protocol=SUPERFRAME, duration_s=26.0)
+    result = run_linear_drive(tmp_path, suspend, 26.0)
     assert check_invariants(result, replay=False) == []
     assert (
         sum(
@@ -112,5 +103,5 @@ def test_restart_waits_for_a_computer_that_is_switched_off(tmp_path: Path) -> No
             group.create_task(mission.reboot(2, 4.0, 4.0))
             group.create_task(mission.restart(2, 5.0))
 
-    result = run_mission(tmp_path, _linear(), script=restart, protocol=SUPERFRAME, duration_s=16.0)
+    result = run_linear_drive(tmp_path, restart, 16.0)
     assert len(result.station_logs[2].journals) == 3

@@ -9,7 +9,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions import run_linear_drive
 
 from tsgt.recording import load_recording
 from tsgt.recording.recorder import Recorder
@@ -17,33 +17,11 @@ from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.setup_lines import parameter_failures
 from tsgt.simulation.faults import FaultKind, draw_faults
 from tsgt.simulation.mission import MASTER, MasterEdit, SetupMistake
-from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
     from pathlib import Path
 
     from tsgt.simulation.mission import Mission, MissionResult
-
-
-def _run(
-    folder: Path,
-    script: Callable[[Mission], Coroutine[None, None, None]] | None,
-    duration_s: float,
-    faults: frozenset[FaultKind] = frozenset(),
-    seed: int = 0,
-) -> MissionResult:
-    scenario = find_scenario("dynamic")
-    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
-    return run_mission(
-        folder,
-        scenario.model_copy(update={"pipeline": pipeline}),
-        script=script,
-        protocol=SUPERFRAME,
-        duration_s=duration_s,
-        faults=faults,
-        seed=seed,
-    )
 
 
 def _missing(result: MissionResult) -> dict[int, int]:
@@ -63,7 +41,7 @@ def test_edited_pose_rate_is_in_force_from_the_restart_on(tmp_path: Path) -> Non
         await mission.sleep_until(8.0)
         await mission.edit_master(MasterEdit(pipeline={"rate_hz": 5.0}), 10.0)
 
-    result = _run(tmp_path, edit, 32.0)
+    result = run_linear_drive(tmp_path, edit, 32.0)
     assert check_invariants(result) == []
     recordings = [load_recording(path) for log in result.master_logs if (path := log.recording())]
     assert [each.parameters.pipeline.period_ns for each in recordings] == [
@@ -90,7 +68,7 @@ def test_station_missing_in_the_master_and_wrong_channel_lose_nothing(tmp_path: 
         await mission.sleep_until(22.0)
         await mission.edit_master(MasterEdit(frequency_mhz=907.4), 8.0)
 
-    result = _run(tmp_path, edit, 50.0)
+    result = run_linear_drive(tmp_path, edit, 50.0)
     assert check_invariants(result, replay=False) == []
     assert [len({m.station for m in log.measurements}) for log in result.master_logs[1::2]] == [2, 0]
     assert max(_missing(result).values()) <= 3
@@ -105,7 +83,7 @@ def test_client_on_another_channel_or_prism_loses_nothing(tmp_path: Path) -> Non
         await mission.make_mistake(1, SetupMistake(frequency_mhz=907.4), 8.0)
         await mission.make_mistake(3, SetupMistake(prism=1), 8.0)
 
-    result = _run(tmp_path, edit, 50.0)
+    result = run_linear_drive(tmp_path, edit, 50.0)
     assert check_invariants(result, replay=False) == []
     assert max(_missing(result).values()) <= 3
 
@@ -119,7 +97,7 @@ def test_suspended_master_restarts(tmp_path: Path) -> None:
         await mission.suspend_master(8.0)
 
     # The kind gives the master a clock that can stand still; this seed draws none.
-    result = _run(tmp_path, suspend, 44.0, frozenset({FaultKind.MASTER_SUSPEND}))
+    result = run_linear_drive(tmp_path, suspend, 44.0, faults=frozenset({FaultKind.MASTER_SUSPEND}))
     assert not result.faults
     before, after = result.master_logs
     assert check_invariants(result) == []
@@ -141,7 +119,7 @@ def test_disk_that_is_full_for_longer_than_lines_can_wait(tmp_path: Path) -> Non
         disk.write_error = None
 
     with patch("tsgt.master.daemon.Recorder", partial(Recorder, max_pending_lines=150)):
-        result = _run(tmp_path, fill, 36.0)
+        result = run_linear_drive(tmp_path, fill, 36.0)
     (log,) = result.master_logs
     status, path = log.statuses[-1].recording, log.recording()
     assert status is not None

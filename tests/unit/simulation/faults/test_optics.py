@@ -8,36 +8,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions import run_linear_drive
 
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.faults import Fault, FaultKind, inject_fault
 from tsgt.simulation.instrument import Lock
-from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from tsgt.simulation.mission import Mission, MissionResult
+    from tsgt.simulation.mission import Mission
 
 AT_S = 8.0
-
-
-def _run(
-    folder: Path, script: Callable[[Mission], Coroutine[None, None, None]], duration_s: float
-) -> MissionResult:
-    scenario = find_scenario("dynamic")
-    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
-    return run_mission(
-        folder,
-        scenario.model_copy(update={"pipeline": pipeline}),
-        script=script,
-        protocol=SUPERFRAME,
-        duration_s=duration_s,
-    )
 
 
 def _fault(kind: FaultKind, duration_s: float, *, station: int | None = 1, seed: int = 1) -> Fault:
@@ -61,7 +45,7 @@ def test_other_robot_takes_the_lock_for_a_while(tmp_path: Path) -> None:
         telescope = mission.instruments[1].telescope
         assert (telescope.lock, telescope.prism) == (Lock.IN, 1)
 
-    result = _run(tmp_path, meet, AT_S + 15.0)
+    result = run_linear_drive(tmp_path, meet, AT_S + 15.0)
     assert followed[0] not in (1, 2, 3)
     assert {violation.check for violation in check_invariants(result, replay=False)} <= {"liveness"}
 
@@ -86,7 +70,7 @@ def test_station_that_follows_another_robot_is_called_back(tmp_path: Path) -> No
         await mission.sleep_until(AT_S + 16.0)
         assert (instrument.telescope.lock, instrument.telescope.prism) == (Lock.IN, 1)
 
-    result = _run(tmp_path, part, AT_S + 17.0)
+    result = run_linear_drive(tmp_path, part, AT_S + 17.0)
     assert {violation.check for violation in check_invariants(result, replay=False)} <= {"liveness"}
 
 
@@ -99,7 +83,7 @@ def test_battery_runs_down_and_is_changed(tmp_path: Path) -> None:
         assert mission.instruments[1].battery_percent > 90
         assert mission.instruments[1].telescope.lock is Lock.IN
 
-    result = _run(tmp_path, fade, 62.0)
+    result = run_linear_drive(tmp_path, fade, 62.0)
     by_time = Counter(each.true_ns // 6_000_000_000 for each in result.station_logs[1].reported_distances)
     assert by_time[1] >= 12  # from 6 s on
     assert 3 <= by_time[4] < by_time[2]  # from 24 s on, and from 12 s on
@@ -123,5 +107,5 @@ def test_weather_is_over_with_its_fault(tmp_path: Path) -> None:
         await asyncio.gather(*tasks)
         assert not any(each.disturbances or each.blocked for each in mission.instruments.values())
 
-    result = _run(tmp_path, storm, AT_S + 12.0)
+    result = run_linear_drive(tmp_path, storm, AT_S + 12.0)
     assert {violation.check for violation in check_invariants(result, replay=False)} <= {"liveness"}

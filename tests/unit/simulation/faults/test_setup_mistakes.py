@@ -6,32 +6,16 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions import run_linear_drive
 from structlog.testing import capture_logs
 
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.mission import SetupMistake
-from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
     from pathlib import Path
 
     from tsgt.simulation.mission import Mission, MissionResult
-
-
-def _run(
-    folder: Path, script: Callable[[Mission], Coroutine[None, None, None]], duration_s: float
-) -> MissionResult:
-    scenario = find_scenario("dynamic")
-    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
-    return run_mission(
-        folder,
-        scenario.model_copy(update={"pipeline": pipeline}),
-        script=script,
-        protocol=SUPERFRAME,
-        duration_s=duration_s,
-    )
 
 
 def _delivered(result: MissionResult) -> dict[int, int]:
@@ -53,7 +37,7 @@ def test_client_with_another_key_or_number(tmp_path: Path) -> None:
         )
 
     with capture_logs() as logs:
-        result = _run(tmp_path, mistakes, 58.0)
+        result = run_linear_drive(tmp_path, mistakes, 58.0)
     assert check_invariants(result, replay=False) == []
     delivered, read = (
         _delivered(result),
@@ -73,7 +57,7 @@ def test_stations_stay_with_their_master(tmp_path: Path) -> None:
         await mission.sleep_until(10.0)
         await mission.run_second_master(16.0)
 
-    result = _run(tmp_path, switch_on, 30.0)
+    result = run_linear_drive(tmp_path, switch_on, 30.0)
     other, _ = result.master_logs
     assert not other.measurements
     assert all(

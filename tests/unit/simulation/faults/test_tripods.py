@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions import run_linear_drive
 
 from tsgt.config import ScenarioConfig
 from tsgt.simulation.checks import check_invariants
@@ -17,7 +17,6 @@ from tsgt.simulation.instrument.model import TILT_LIMIT_RAD
 from tsgt.simulation.kernel import VirtualTimeline, run_virtual
 from tsgt.simulation.mission import Mission
 from tsgt.simulation.options import SimulationOptions
-from tsgt.simulation.scenario_files import find_scenario
 from tsgt.simulation.world import HIDDEN_ROLL_RAD, Rollover, scenario_world
 
 if TYPE_CHECKING:
@@ -136,10 +135,7 @@ def test_turned_tripod_is_reported_until_it_is_calibrated(tmp_path: Path) -> Non
         await mission.sleep_until(48.0)
         await mission.recalibrate()
 
-    scenario = find_scenario("dynamic")
-    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
-    scenario = scenario.model_copy(update={"pipeline": pipeline})
-    result = run_mission(tmp_path, scenario, script=turn, protocol=SUPERFRAME, duration_s=64.0)
+    result = run_linear_drive(tmp_path, turn, 64.0)
     assert check_invariants(result, replay=False) == []
     before, after = result.master_logs
     layout = [event for event in before.events if event.event.startswith("layout")]

@@ -6,11 +6,10 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions import run_linear_drive
 from harness.passed_on import PassedOn
 
 from tsgt.simulation.mission import MASTER
-from tsgt.simulation.scenario_files import find_scenario
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,10 +29,7 @@ def test_relay_and_page_get_the_stream_of_both_masters(tmp_path: Path) -> None:
     async def script(mission: Mission) -> None:
         await asyncio.gather(passed_on.follow(mission, tmp_path, 15.0), crash(mission))
 
-    scenario = find_scenario("dynamic")
-    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
-    scenario = scenario.model_copy(update={"pipeline": pipeline})
-    result = run_mission(tmp_path / "m", scenario, script=script, protocol=SUPERFRAME, duration_s=15.0)
+    result = run_linear_drive(tmp_path / "m", script, 15.0)
     assert list(passed_on.failures(result)) == []
     assert len(passed_on.relayed.connections) == 2
     assert len(passed_on.page.lines.connections) == 2

@@ -184,3 +184,12 @@ def inertial_drive(duration_s: float, *, scenario: str = "dynamic", seed: int = 
         frames[row, :3, 3] = station.position_m
     layout = np.array([each.position_m for each in config.prisms])
     return InertialDrive(pose[:, :3, 3], Rotation.from_matrix(pose[:, :3, :3]), layout, frames)
+
+
+def standing_from(drive: InertialDrive, at_s: float, *, until_s: float) -> InertialDrive:
+    """Return the drive of a robot that slows down within a second and then stands."""
+    time_s = np.arange(round(until_s / GRID_S)) * GRID_S
+    since_s = np.clip(time_s - at_s, 0.0, 1.0)
+    driven_s = np.minimum(time_s, at_s) + since_s - since_s**3 + 0.5 * since_s**4
+    position = np.stack([np.interp(driven_s, drive.time_s, each) for each in drive.position.T], axis=1)
+    return replace(drive, position=position, rotation=Slerp(drive.time_s, drive.rotation)(driven_s))

@@ -4,7 +4,8 @@ In: samples of an IMU as arrays, its calibration, polar measurements of the pris
 docs/explanation/imu.md derives the equations.
 """
 
-from tsgt.geometry.inertial.factors import InertialAnchor, InertialFactors
+from tsgt.geometry.inertial.anchor import InertialAnchor
+from tsgt.geometry.inertial.factors import InertialFactors
 from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
 from tsgt.geometry.inertial.live import (
     DISAGREES_WITH_PRISMS,
@@ -27,7 +28,6 @@ from tsgt.geometry.inertial.solver import (
     MAX_KNOT_SPACING_S,
     InertialSetup,
     InertialSolution,
-    anchor_at_end,
     inertial_knot_times,
     solve_inertial,
 )
@@ -62,7 +62,6 @@ __all__ = [
     "WheelsEstimate",
     "WheelsFit",
     "WindowTrajectory",
-    "anchor_at_end",
     "concatenate_inertial_states",
     "concatenate_samples",
     "contiguous",

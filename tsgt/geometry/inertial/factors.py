@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tsgt.geometry.inertial.anchor import InertialAnchor
     from tsgt.geometry.inertial.odometry import Odometry, OdometrySteps
     from tsgt.geometry.inertial.preintegration import ContiguousSamples
     from tsgt.geometry.trajectory.measurement_factors import LinearisedMeasurements, Observations
@@ -180,16 +181,6 @@ class InertialEquations(NamedTuple):
     whitened: FloatArray  # (M, 3, D + 1) Jacobians and residuals of measurements, without the robust weights
 
 
-@dataclass(frozen=True, slots=True)
-class InertialAnchor:
-    """Gaussian prior on the first knot and on what all knots share, which may be correlated."""
-
-    linearisation_point: InertialStates  # One knot about which the error is counted
-    shared: FloatArray  # (S,) likewise
-    information: FloatArray  # (D + S, D + S) inverse covariance of the errors
-    mean: FloatArray  # (D + S,) of the errors
-
-
 def assemble_inertial(
     observations: Observations,
     knot_index: NDArray[np.intp],
@@ -248,10 +239,9 @@ def assemble_inertial(
     if factors.odometry is not None:
         cost += add_wheel_processes(knots.wheels, factors.odometry, diagonal, off_diagonal, gradient)
 
-    first = knots.select(slice(0, 1)).local_coordinates_about(anchor.linearisation_point)[0]
-    by_error = np.eye(size + shared)
-    by_error[3:6, 3:6] = inverse_right_jacobian(first[3:6])
-    error = np.concatenate([first, gravity.shared - anchor.shared]) - anchor.mean
+    first = knots.select(slice(0, 1))
+    error = anchor.errors(first, gravity.shared[None])[0]
+    by_error = anchor.jacobian(first, error)
     weighted = by_error.T @ anchor.information
     information, by_anchor = weighted @ by_error, weighted @ error
     diagonal[0] += information[:size, :size]
@@ -415,9 +405,8 @@ def inertial_costs(
             costs[row] += float(robust_loss(dot(residuals, residuals))[1].sum())
             costs[row] += wheel_process_cost(each.wheels, factors.odometry)
 
-    first = trajectories.select(first_rows).local_coordinates_about(anchor.linearisation_point)
-    shared = np.array([gravity.shared for gravity in gravities]) - anchor.shared
-    errors = np.concatenate([first, shared], axis=1) - anchor.mean
+    shared = np.array([gravity.shared for gravity in gravities])
+    errors = anchor.errors(trajectories.select(first_rows), shared)
     costs += ((errors @ anchor.information) * errors).sum(axis=1)
     return costs
 

@@ -18,8 +18,8 @@ from tsgt.geometry.rigid import IDENTITY, skew
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tsgt.geometry.inertial.anchor import InertialAnchor
     from tsgt.geometry.inertial.bordered import BorderedCholesky
-    from tsgt.geometry.inertial.factors import InertialAnchor
     from tsgt.geometry.inertial.solver import InertialSolution
     from tsgt.geometry.inertial.states import Mounting
     from tsgt.geometry.rigid import FloatArray
@@ -78,7 +78,7 @@ class InertialSensitivity:
         )
         shared = np.zeros((factor.border.shape[2], by_setup.shape[2]))
         if anchor is not None and anchor_displacement is not None:
-            by_anchor = anchor.information @ anchor_displacement
+            by_anchor = anchor.pull(anchor_displacement)
             mixed[0] -= by_anchor[:size]
             shared -= by_anchor[size:]
         displaced, shared_displaced = factor.solve(mixed, shared)

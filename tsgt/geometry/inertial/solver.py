@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from tsgt.geometry.inertial.anchor import InertialAnchor
 from tsgt.geometry.inertial.bordered import BorderedCholesky, factorise_bordered
 from tsgt.geometry.inertial.factors import (
-    InertialAnchor,
     InertialEquations,
     InertialFactors,
     assemble_inertial,
@@ -147,17 +147,6 @@ def diffuse_inertial_prior(
         wheels=np.zeros_like(first.wheels),
     )
     return InertialAnchor(about, np.zeros(gravity.dim), np.diag(sigmas**-2.0), np.zeros(len(sigmas)))
-
-
-def anchor_at_end(solution: InertialSolution) -> InertialAnchor:
-    """Prior on the last knot of a solution that contains all that its measurements and its anchor say."""
-    information = solution.factor.last_information()
-    return InertialAnchor(
-        solution.knots.select(slice(-1, None)),
-        solution.gravity.shared,
-        information,
-        np.zeros(len(information)),
-    )
 
 
 def solve_inertial(

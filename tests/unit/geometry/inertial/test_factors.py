@@ -11,8 +11,8 @@ from harness.inertial_drive import DEG, GRADES
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry.inertial import InertialSamples, contiguous
+from tsgt.geometry.inertial.anchor import InertialAnchor
 from tsgt.geometry.inertial.factors import (
-    InertialAnchor,
     InertialFactors,
     assemble_inertial,
     inertial_costs,
@@ -133,6 +133,8 @@ class Problem(NamedTuple):
             np.full(8, 0.01),
             square @ square.T,
             rng.normal(scale=0.01, size=size),
+            rng.normal(size=3),
+            rng.normal(size=3),
         )
         return cls(observations, knot_index, samples.at(states.time_s), factors, anchor)
 

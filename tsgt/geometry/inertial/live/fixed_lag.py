@@ -14,10 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.inertial.factors import (
-    InertialAnchor,
-    InertialEquations,
-)
+from tsgt.geometry.inertial.anchor import InertialAnchor
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
 from tsgt.geometry.inertial.live.health import HealthMonitor
 from tsgt.geometry.inertial.live.known_rotation import KnownRotation
@@ -64,6 +61,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.inertial.bordered import BorderedCholesky
+    from tsgt.geometry.inertial.factors import (
+        InertialEquations,
+    )
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
@@ -633,11 +633,13 @@ class InertialFixedLagSmoother(MeasurementWindow):
             linearised = system.linearised, system.weights, knot_index[is_past]
             solved = Linearised(past, *linearised, window.anchor, self._anchor_displacement)
             self._anchor_displacement = self._sensitivity.at_last(solved, factor)
-        anchor = InertialAnchor(
+        anchor = InertialAnchor.at_point(
             window.knots.select(slice(first, first + 1)),
             self._gravity.shared,
             factor.last_information(),
             np.concatenate([step[first], shared]),
+            past.layout[past.prism].mean(axis=0) if len(past) else window.anchor.point,
+            window.kinematics[0][first],
         )
         self._window = replace(window.select(slice(first, None)), anchor=anchor)
 

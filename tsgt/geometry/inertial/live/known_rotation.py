@@ -10,7 +10,7 @@ from tsgt.geometry.inertial.preintegration import preintegrate
 from tsgt.geometry.rigid import exp_so3
 
 if TYPE_CHECKING:
-    from tsgt.geometry.inertial.factors import InertialAnchor
+    from tsgt.geometry.inertial.anchor import InertialAnchor
     from tsgt.geometry.inertial.preintegration import ContiguousSamples
     from tsgt.geometry.rigid import FloatArray
     from tsgt.model import ImuNoise

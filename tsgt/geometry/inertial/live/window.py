@@ -9,7 +9,6 @@ import numpy as np
 
 from tsgt.geometry.inertial.bordered import BorderedCholesky, factorise_bordered
 from tsgt.geometry.inertial.factors import (
-    InertialAnchor,
     InertialEquations,
     InertialFactors,
     assemble_inertial,
@@ -22,6 +21,7 @@ from tsgt.geometry.trajectory.motion_prior import transition
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tsgt.geometry.inertial.anchor import InertialAnchor
     from tsgt.geometry.inertial.odometry import Odometry
     from tsgt.geometry.inertial.preintegration import ContiguousSamples
     from tsgt.geometry.inertial.sensitivity import Linearised

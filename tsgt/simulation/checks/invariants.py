@@ -58,6 +58,10 @@ _MAX_LATENCY_NS = 5_000_000_000
 _LINE_ROUNDING = 1e-9
 # Spread of response times, which limits the first timestamps.
 _MAX_TIMESTAMP_ERROR_NS = 40_000_000
+# The fastest response, which the configuration subtracts.
+_FASTEST_RESPONSE_NS = 20_000_000
+# An instrument that was switched off and on takes 5 s until it responds.
+_MAX_CLOCK_JUMP_NS = 1_000_000_000
 # Limit of the median over at least this number; the median of a whole mission is within 1 ms.
 _MIN_TIMESTAMPS = 40
 _MAX_MEDIAN_ERROR_NS = 5_000_000
@@ -179,40 +183,62 @@ def _may_be_unwritten(station_log: StationLog, delivered: PolarMeasurement, star
 def reading_mismatches(station_log: StationLog, journal_index: JournalIndex) -> Iterator[Violation]:
     """Compare the distances in a station's journals with those that its instrument reported."""
     seen: set[ReportedDistance] = set()
-    errors_ns: list[int] = []
+    errors_ns: list[int] = []  # of clients that know how fast the instrument usually responds
     by_time_ms: dict[int, list[ReportedDistance]] = {}
     for each in station_log.reported_distances:
         by_time_ms.setdefault(each.instrument_ms, []).append(each)
-    for journalled in journal_index.journalled:
-        if journalled.slope_distance_m is None or journalled.instrument_time_ns is None:
-            continue
-        candidates = by_time_ms.get(journalled.instrument_time_ns // 1_000_000, [])
-        truth = next((each for each in candidates if _matches(each, journalled)), None)
-        if truth is None:
-            yield Violation(
-                "reading",
-                f"station {station_log.station}: journalled, but never reported by the instrument: {journalled}",
-            )
-            continue
-        if truth in seen:
-            yield Violation("reading", f"station {station_log.station}: journalled twice: {journalled}")
-        seen.add(truth)
-        stamp_ns = journal_index.true_ns(journalled)
-        if stamp_ns is None:
-            continue
-        errors_ns.append(stamp_ns - truth.true_ns)
-        if abs(errors_ns[-1]) > _MAX_TIMESTAMP_ERROR_NS:
-            yield Violation(
-                "reading",
-                f"station {station_log.station}: timestamp error {errors_ns[-1] / 1e6:.1f} ms, "
-                f"limit {_MAX_TIMESTAMP_ERROR_NS / 1e6:g} ms: {journalled}",
-            )
+    for measurements in journal_index.journalled_by_start:
+        previous: ReportedDistance | None = None
+        slowed_by = 1.0  # when the client began to fit the instrument's clock
+        for journalled in measurements:
+            if journalled.slope_distance_m is None or journalled.instrument_time_ns is None:
+                continue
+            candidates = by_time_ms.get(journalled.instrument_time_ns // 1_000_000, [])
+            truth = next((each for each in candidates if _matches(each, journalled)), None)
+            if truth is None:
+                yield Violation(
+                    "reading",
+                    f"station {station_log.station}: journalled, but never reported by the instrument: {journalled}",
+                )
+                continue
+            if truth in seen:
+                yield Violation("reading", f"station {station_log.station}: journalled twice: {journalled}")
+            seen.add(truth)
+            if previous is None or _switched_on_between(previous, truth):
+                slowed_by = truth.slowed_by
+            previous = truth
+            stamp_ns = journal_index.true_ns(journalled)
+            if stamp_ns is None:
+                continue
+            error_ns, limit_ns = stamp_ns - truth.true_ns, _timestamp_limit_ns(slowed_by)
+            if slowed_by <= 1.0:
+                errors_ns.append(error_ns)
+            if abs(error_ns) > limit_ns:
+                yield Violation(
+                    "reading",
+                    f"station {station_log.station}: timestamp error {error_ns / 1e6:.1f} ms, "
+                    f"limit {limit_ns / 1e6:g} ms: {journalled}",
+                )
     if len(errors_ns) >= _MIN_TIMESTAMPS and abs(median_ns := median(errors_ns)) > _MAX_MEDIAN_ERROR_NS:
         yield Violation(
             "reading",
             f"station {station_log.station}: median timestamp error of {len(errors_ns)} measurements "
             f"{median_ns / 1e6:.1f} ms, limit {_MAX_MEDIAN_ERROR_NS / 1e6:g} ms",
         )
+
+
+def _switched_on_between(before: ReportedDistance, after: ReportedDistance) -> bool:
+    """Whether the count of the instrument has restarted between two distances."""
+    passed_ns = (after.instrument_ms - before.instrument_ms) * 1_000_000
+    return abs(after.true_ns - before.true_ns - passed_ns) > _MAX_CLOCK_JUMP_NS
+
+
+def _timestamp_limit_ns(slowed_by: float) -> float:
+    """Return the limit for a client that has seen only responses that take this many times longer than usual.
+
+    Nothing tells it that the fastest of them is late, see docs/explanation/instrument-time.md.
+    """
+    return slowed_by * _MAX_TIMESTAMP_ERROR_NS + (slowed_by - 1.0) * _FASTEST_RESPONSE_NS
 
 
 def _matches(reported: ReportedDistance, journalled: PolarMeasurement) -> bool:

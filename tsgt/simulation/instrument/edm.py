@@ -71,6 +71,11 @@ class EdmSchedule:
         self.clear()
         self._single_ns = done_ns
 
+    @property
+    def slowed_by(self) -> float:
+        """Interval of continuous measurements as a multiple of the usual one."""
+        return self._period_ns / self._usual_period_ns
+
     def slow_down(self, factor: float, now_ns: int) -> None:
         """Measure at this multiple of the usual interval from the newest instant on; 1: as usual."""
         number = self._newest_number(now_ns)

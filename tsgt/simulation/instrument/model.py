@@ -61,6 +61,7 @@ class ReportedDistance(NamedTuple):
     distance_m: float
     prism: int | None  # None: a foil target
     code: int  # GeoCOM return code
+    slowed_by: float = 1.0  # how many times slower than usual the instrument was
 
 
 class TotalStationModel:
@@ -325,6 +326,7 @@ class TotalStationModel:
             distance_m=(distance_m - true_constant_m) * scale + constant_m,
             prism=seen.prism,
             code=seen.code,
+            slowed_by=self.edm.slowed_by,
         )
 
     def _pointing_direction(self, seen: TargetObservation, at_ns: int) -> PolarDirection | None:

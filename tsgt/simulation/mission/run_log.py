@@ -319,6 +319,7 @@ class JournalIndex:
         self.station_log = station_log
         self._true_ns = station_log.true_times_ns
         journals = [load_journal(path) for path in station_log.journals if _has_header(path)]
+        self.journalled_by_start = [journal.measurements for journal in journals]
         self.journalled = [m for journal in journals for m in journal.measurements]
         self._heads = {m.sequence: journal.head for journal in journals for m in journal.measurements}
         self.sent_us: dict[

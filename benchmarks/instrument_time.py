@@ -47,6 +47,8 @@ class Case(NamedTuple):
     drift_ppm: float = 20.0
     wander_ppm: float = 0.0
     gap_s: tuple[float, float] = (0.0, 0.0)
+    slows_s: tuple[float, float] = (0.0, 0.0)
+    """Begin and end of a time in which responses become slower, four times in the end."""
     no_fastest: bool = False
     """Whether the delay has no sharp lower end: then errors are against their own median."""
 
@@ -66,6 +68,7 @@ CASES = (
     Case("every tenth 300 to 700 ms late", delay_ms=_stalling),
     Case("normally late, sigma 6 ms", delay_ms=lambda random: abs(random.normal(30, 6)), no_fastest=True),
     Case("nothing from 30 s to 90 s", gap_s=(30.0, 90.0)),
+    Case("slower from 30 s to 150 s, in the end four times", slows_s=(30.0, 150.0)),
 )
 
 
@@ -88,9 +91,12 @@ def errors(case: Case, seed: int) -> list[tuple[float, float, float]]:
         instrument_ms = math.floor(
             instrument_at_zero_ms + 1e3 * (true_s * (1 + drift) + 0.5 * wander * true_s**2)
         )
-        arrived_ns = round(1e9 * (1000 + true_s) + 1e6 * (FASTEST_MS + case.delay_ms(random)))
+        delay_ms = FASTEST_MS + case.delay_ms(random)
+        if case.slows_s[0] <= true_s < case.slows_s[1]:
+            delay_ms *= 4.0 ** ((true_s - case.slows_s[0]) / (case.slows_s[1] - case.slows_s[0]))
+        arrived_ns = round(1e9 * (1000 + true_s) + 1e6 * delay_ms)
         if not is_distance:
-            clock.add(instrument_ms, arrived_ns)
+            clock.add(instrument_ms, arrived_ns, round(1e6 * delay_ms))
             continue
         time = clock.timestamp(instrument_ms, arrived_ns + 40_000_000)
         if time is not None:

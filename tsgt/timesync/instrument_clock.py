@@ -45,6 +45,13 @@ _REFIT_GROWTH = 1.05  # refit without other news when the number of samples has 
 _MIN_DELAY_SHARE = 0.01
 _DELAY_CAP = 4.0  # a delay counts as at most this many mean delays: a stall says nothing about the others
 
+_SLOW_SHARE = 0.75
+_SLOW_EXCHANGES = 4
+_MIN_TIMED = 20
+"""An exchange is slow if it takes longer than the fastest one, plus this share of what they take longer on average. After
+this many in succession the instrument has become slower. Then a sample bounds the envelope, but does not count in the fit:
+delays that grow would pass for a skew. The average is known from this many exchanges on."""
+
 _CANDIDATES = 3
 _CANDIDATE_SPREAD_NS = 100e6
 _CANDIDATE_WINDOW = 32
@@ -61,14 +68,18 @@ class HostTime(NamedTuple):
 
 @dataclass(slots=True)
 class _Bin:
-    """Two seconds of samples: the lowest one, and sums over all."""
+    """Two seconds of samples: the lowest one, sums over those that count, and over the exchanges of known duration among them."""
 
     number: int
     x: float
     y: float
-    count: int = 0
+    count: int = 0  # of all
+    counted: int = 0
     sum_x: float = 0.0
     sum_y: float = 0.0
+    timed: int = 0
+    sum_took: float = 0.0
+    min_took: float = math.inf
 
 
 class InstrumentClock:
@@ -97,7 +108,8 @@ class InstrumentClock:
         self._mean_delay = self._excess = self._sigma = 0.0
         self._skew_sigma = self._known_sigma
         self._newest = self._pivot = 0.0
-        self._samples = self._fitted = 0
+        self._samples = self._counted = self._fitted = 0
+        self._slow = 0  # how many of the last exchanges were slow
         self._candidates: deque[tuple[int, int, int]] = deque(maxlen=_CANDIDATES)
 
     @property
@@ -128,8 +140,11 @@ class InstrumentClock:
             if self.initialised:
                 self._fit()
 
-    def add(self, instrument_ms: int, arrived_ns: int) -> bool:
-        """Take an instrument time and its first byte's arrival. Returns False if the count jumped; that resets the fit."""
+    def add(self, instrument_ms: int, arrived_ns: int, took_ns: int | None = None) -> bool:
+        """Take an instrument time and its first byte's arrival. Returns False if the count jumped; that resets the fit.
+
+        ``took_ns``: from the request to the arrival; None: unknown.
+        """
         self._seen += 1
         self.inconsistent = False
         if not self.initialised:
@@ -141,7 +156,7 @@ class InstrumentClock:
         delay = y - self._height - self._skew * x
         if not -self._gate(x) <= delay <= MAX_DELAY_NS:
             return self._add_inconsistent(instrument_ms, arrived_ns)
-        new_bin = self._put(x, y)
+        new_bin = self._put(x, y, took_ns)
         below = y < self._height + self._skew * x
         if new_bin or below or self._samples > _REFIT_GROWTH * self._fitted:
             self._fit()
@@ -215,7 +230,7 @@ class InstrumentClock:
         """Return how far below the envelope a sample may lie and still be a faster response, in ns."""
         return _RESOLUTION_NS + 10 * self._excess + 3 * self._skew_sigma * abs(x - self._pivot)
 
-    def _put(self, x: float, y: float) -> bool:
+    def _put(self, x: float, y: float, took_ns: int | None = None) -> bool:
         """Put a sample into its bin; return whether it starts a new one."""
         bins = self._bins
         number = math.floor(x / _BIN_NS)
@@ -224,18 +239,37 @@ class InstrumentClock:
             bins.append(_Bin(number, x, y))
             oldest = number - _WINDOW_NS / _BIN_NS
             while bins[0].number < oldest and self._samples - bins[0].count >= _MIN_KEPT_SAMPLES:
-                self._samples -= bins.popleft().count
+                self._samples -= bins[0].count
+                self._counted -= bins.popleft().counted
         bin_ = next((bin_ for bin_ in reversed(bins) if bin_.number <= number), bins[0])
         if y - self._skew * x < bin_.y - self._skew * bin_.x:
             bin_.x, bin_.y = x, y
         bin_.count += 1
+        self._samples += 1
+        self._newest = max(self._newest, x)
+        self._slow = self._slow + 1 if took_ns is not None and self._is_slow(took_ns) else 0
+        if self._slow >= _SLOW_EXCHANGES:
+            return new
+        self._counted += 1
+        bin_.counted += 1
         bin_.sum_x += x
         bin_.sum_y += min(
             y, self._height + self._skew * x + _DELAY_CAP * max(self._mean_delay, _RESOLUTION_NS)
         )
-        self._samples += 1
-        self._newest = max(self._newest, x)
+        if took_ns is not None:
+            bin_.timed += 1
+            bin_.sum_took += took_ns
+            bin_.min_took = min(bin_.min_took, took_ns)
         return new
+
+    def _is_slow(self, took_ns: int) -> bool:
+        """Whether an exchange took longer than usual."""
+        timed = sum([bin_.timed for bin_ in self._bins])
+        if timed < _MIN_TIMED:
+            return False
+        mean = sum([bin_.sum_took for bin_ in self._bins]) / timed
+        fastest = min([bin_.min_took for bin_ in self._bins])
+        return took_ns > fastest + _SLOW_SHARE * (mean - fastest)
 
     def _add_inconsistent(self, instrument_ms: int, arrived_ns: int) -> bool:
         """Hold a sample until enough others agree with it; return False if they reset the fit."""
@@ -252,7 +286,7 @@ class InstrumentClock:
             # The minimum delay or the skew has changed: the old envelope is void, the origin stays.
             self._candidates.clear()
             self._bins.clear()
-            self._samples = 0
+            self._samples = self._counted = 0
             for x, y in points:
                 self._put(x, y)
             self._fit()
@@ -266,14 +300,14 @@ class InstrumentClock:
     def _fit(self) -> None:
         """Fit the envelope to all samples."""
         bins = self._bins
-        mean_x = sum(bin_.sum_x for bin_ in bins) / self._samples
-        mean_y = sum(bin_.sum_y for bin_ in bins) / self._samples
+        mean_x = sum(bin_.sum_x for bin_ in bins) / self._counted
+        mean_y = sum(bin_.sum_y for bin_ in bins) / self._counted
         envelope = min(bin_.y - self._skew * (bin_.x - mean_x) for bin_ in bins)
         mean_delay = mean_y - envelope
         self._mean_delay = (
-            mean_delay if self._samples >= _MIN_KEPT_SAMPLES else max(mean_delay, self._mean_delay)
+            mean_delay if self._counted >= _MIN_KEPT_SAMPLES else max(mean_delay, self._mean_delay)
         )
-        share = max(2 * mean_delay / max(self._samples - 1, 1) / _RESOLUTION_NS, _MIN_DELAY_SHARE)
+        share = max(2 * mean_delay / max(self._counted - 1, 1) / _RESOLUTION_NS, _MIN_DELAY_SHARE)
         # Without truncation the minimum delay is exponentially distributed: mean and sigma are the same.
         lowest = minimum_delay(share) if self._whole_ms else MinimumDelay(share, share)
         line = fit_lower_envelope(
@@ -285,13 +319,14 @@ class InstrumentClock:
         )
         self._skew = line.slope
         self._skew_sigma = line.slope_sigma + _SKEW_WANDER
-        if bins[-1].x - bins[0].x > _STEADY_NS:
+        counted_x = [bin_.x for bin_ in bins if bin_.counted]
+        if counted_x[-1] - counted_x[0] > _STEADY_NS:
             self._known_skew, self._known_sigma = self._skew, _KNOWN_SKEW_SIGMA
         self._height = min(bin_.y - self._skew * bin_.x for bin_ in bins)
         # A time in whole ms is truncated: the distance was taken half of one later on average.
         truncation = 0.5 if self._whole_ms else 0.0
         self._lift = line.height - self._height + (truncation - lowest.mean) * _RESOLUTION_NS
-        self._excess = 2 * self._mean_delay / self._samples
+        self._excess = 2 * self._mean_delay / self._counted
         rounding_ns = _ROUNDING_NS if self._whole_ms else 0.0
         self._sigma = math.hypot(rounding_ns, lowest.sigma * _RESOLUTION_NS, line.pivot_sigma)
         self._pivot = line.pivot

@@ -218,3 +218,40 @@ def test_bound_contains_nearly_all_times() -> None:
         for period_ms in 20 * [50, 400, 1000]
     )
     assert outside <= 60 * 300 // 100
+
+
+def test_slower_responses_are_no_skew() -> None:
+    """While responses become four times as slow within two minutes, after ten seconds, times stay within their bounds."""
+    random = np.random.default_rng(3)
+    clock = InstrumentClock()
+    at_s = 0.0
+    while at_s < 130.0:
+        ms = 5_000_000 + round(1000 * at_s)
+        delay_ms = random.uniform(FASTEST_MS, 3 * FASTEST_MS) * 4.0 ** max((at_s - 10.0) / 120.0, 0.0)
+        clock.add(ms, arrived_ns(ms, delay_ms - FASTEST_MS), round(delay_ms * MS))
+        if (time := clock.at(ms)) is not None:
+            assert abs(time.host_ns - arrived_ns(ms)) < time.bound_ns
+        at_s += 0.15 if at_s < 6.0 else 0.5
+
+
+def test_clock_follows_responses_that_stay_slower() -> None:
+    """When the window has no others any more, they are the usual ones."""
+    clock = InstrumentClock()
+    for number in range(1000):
+        ms = 5_000_000 + 500 * number
+        late_ms = 10.0 * (number % 4) + (40.0 if number > 200 else 0.0)
+        assert clock.add(ms, arrived_ns(ms, late_ms), round((FASTEST_MS + late_ms) * MS))
+    time = clock.at(5_500_000)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(5_500_000, 40.0)) < MS
+
+
+def test_some_slow_exchanges_count() -> None:
+    """A few in succession are chance: the result is that without durations."""
+    timed, untimed = InstrumentClock(), InstrumentClock()
+    for number in range(400):
+        ms = 5_000_000 + 500 * number
+        late_ms = 10.0 * (number % 4)
+        timed.add(ms, arrived_ns(ms, late_ms), round((FASTEST_MS + late_ms) * MS))
+        untimed.add(ms, arrived_ns(ms, late_ms))
+    assert timed.at(5_200_000) == untimed.at(5_200_000)

@@ -128,7 +128,7 @@ class DistanceTimestamper:
         if isinstance(fit, ExchangeClock):
             fit.add(time_ms, reply.sent_ns, max(reply.first_byte_ns - self.latency_ns, reply.sent_ns))
         else:
-            fit.add(time_ms, reply.first_byte_ns)
+            fit.add(time_ms, reply.first_byte_ns, reply.first_byte_ns - reply.sent_ns)
         self._report_reset(resets)
         return True
 

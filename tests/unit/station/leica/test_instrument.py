@@ -529,6 +529,24 @@ async def test_power_cycle_resets_instrument_clock() -> None:
         assert abs(reading.at_ns - true_ns[reading.instrument_time_ns // 1_000_000]) < 20_000_000
 
 
+async def test_times_of_a_slowing_instrument() -> None:
+    """An instrument that becomes four times as slow within two minutes does not pass for one whose clock runs slower."""
+    async with leica_bench(leica_config(latency_ms=20.0)) as day:
+        await day.begin()
+        errors_ms = []
+        for second in range(150):
+            day.station.slow_down(4.0 ** max((second - 30) / 120, 0.0))
+            readings = await day.read_for(1.0)
+            offered = {each.instrument_ms: each.true_ns for each in day.station.reported_distances}
+            errors_ms += [
+                (reading.at_ns - offered[reading.instrument_time_ns // 1_000_000]) / 1e6
+                for reading in readings
+                if reading.instrument_time_ns is not None
+            ]
+    assert len(errors_ms) > 130
+    assert np.abs(errors_ms).max() < 8.0
+
+
 async def test_close_aborts_search() -> None:
     """At the instrument too, and no task is left."""
     async with leica_bench(faults=[occlusion(3.0, 60.0)]) as day:

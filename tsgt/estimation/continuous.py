@@ -27,7 +27,7 @@ from tsgt.estimation.setup_uncertainty import InertialSetupUncertainty, setup_ja
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
-from tsgt.geometry.inertial import InertialFixedLagSmoother
+from tsgt.geometry.inertial import InertialFixedLagSmoother, SaturationMonitor
 from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ class ContinuousEstimator:
         self._noise_scales = noise_scales(parameters)
         self._poses = ContinuousPoseOutput(parameters)
         self._without_imu = FixedLagSmoother(self._limits.motion, setup_jacobian(parameters))
+        # What one window with the IMU has learned of the device's limits holds for the next.
+        self._saturation = None if parameters.imu is None else SaturationMonitor(parameters.imu)
         self._imu = (
             None
             if parameters.imu is None
@@ -116,6 +118,7 @@ class ContinuousEstimator:
             setup_jacobian=uncertainty.setup_jacobian,
             mounting_factor=uncertainty.mounting_factor,
             odometry=self._parameters.odometry,
+            saturation=self._saturation,
         )
 
     def begin_at(self, now_ns: int) -> None:

@@ -31,7 +31,7 @@ from tsgt.model import ImuSamples, Measurement, OdometryParameters, OdometrySamp
 from tsgt.recording import PoseRecord, encode_line
 
 if TYPE_CHECKING:
-    from tsgt.geometry.inertial import InertialSamples, WheelSamples
+    from tsgt.geometry.inertial import InertialSamples, SaturationMonitor, WheelSamples
     from tsgt.model import ImuParameters, MotionPrior
 
 LINE_S = 0.05
@@ -44,8 +44,11 @@ class FakeInertialSmoother(FixedLagSmoother):
 
     created: ClassVar[list[FakeInertialSmoother]] = []
 
-    def __init__(self, _imu: ImuParameters, prior: MotionPrior, **_: Any) -> None:
+    def __init__(
+        self, _imu: ImuParameters, prior: MotionPrior, *, saturation: SaturationMonitor, **_: Any
+    ) -> None:
         super().__init__(prior)
+        self.saturation = saturation
         self.up_m = UP_M
         self.health: str | None = None
         self.setup_in_doubt = self.blow = False
@@ -192,6 +195,8 @@ def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any],
     assert 2.0 < from_s < 2.65
     assert until_s == pytest.approx(from_s + QUARANTINE_S, abs=0.11)
     assert len(FakeInertialSmoother.created) == 2
+    # What the first has learned of the device's limits
+    assert len({id(each.saturation) for each in FakeInertialSmoother.created}) == 1
 
 
 def test_poses_after_a_takeover_are_those_of_an_estimator_without_imu(scene: Scene) -> None:

@@ -10,6 +10,7 @@ from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading,
 from tsgt.geometry.inertial.live import (
     DISAGREES_WITH_PRISMS,
     InertialFixedLagSmoother,
+    SaturationMonitor,
     WindowTrajectory,
     sound_samples,
 )
@@ -58,6 +59,7 @@ __all__ = [
     "Mounting",
     "Odometry",
     "Preintegrated",
+    "SaturationMonitor",
     "WheelSamples",
     "WheelsEstimate",
     "WheelsFit",

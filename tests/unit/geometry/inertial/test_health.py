@@ -10,7 +10,12 @@ import pytest
 from harness.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.geometry import FloatArray, exp_so3
-from tsgt.geometry.inertial import InertialFixedLagSmoother, InertialSamples, sound_samples
+from tsgt.geometry.inertial import (
+    InertialFixedLagSmoother,
+    InertialSamples,
+    SaturationMonitor,
+    sound_samples,
+)
 from tsgt.geometry.inertial.live.health import HOLD_S, MAX_AGE_S, STUCK_S, HealthMonitor
 from tsgt.model import MotionPrior
 
@@ -172,6 +177,38 @@ def test_axis_that_is_at_its_limit_at_once_is_noticed_within_a_line_or_two() -> 
     _, used, reasons = judged(quantised(samples, 1e-6))
     assert reasons.index("the angular rate is at the limit of the device") == 70
     assert not used[704:740].any()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_limit_is_known_to_the_monitor_of_the_next_window(sign: float) -> None:
+    """One value at it, which nothing repeats, is left out, until another is beyond it."""
+    rates = SAMPLES.angular_rate_radps.copy()
+    wave = np.sin(0.1 * np.arange(len(rates)))
+    rates[:, 1] = sign * np.where(np.arange(len(rates)) < 500, np.minimum(0.3 * wave, 0.29), 0.25 * wave)
+    limited = rates[:, 1] == sign * 0.29
+    rates[[700, 900, 1000], 1] = sign * np.array([0.29, 0.295, 0.29])
+    samples = replace(SAMPLES, angular_rate_radps=rates)
+    saturation = SaturationMonitor(IMU)
+    first = HealthMonitor(IMU, saturation)
+    np.testing.assert_array_equal(first.samples(samples.select(slice(400))), ~limited[:400])
+    second = HealthMonitor(IMU, saturation)
+    reasons, used = [], []
+    for start in range(600, 1100, 10):
+        used.append(second.samples(samples.select(slice(start, start + 10))))
+        reasons.append(second.reason)
+    assert (600 + np.flatnonzero(~np.concatenate(used))).tolist() == [700]
+    assert reasons[9:11] == [None, "the angular rate is at the limit of the device"]
+
+
+def test_limit_between_the_steps_of_a_device_is_no_smaller_step() -> None:
+    """Else coarse values of a robot at rest, which come again and again, would be at a limit."""
+    samples = quantised(at_rest(), 2e-4)
+    forces = samples.specific_force_mps2
+    forces[300:320:2, 2] = 11.00002
+    forces[301:321:2, 2] = 11.0 - 0.002 * np.arange(10)
+    _, used, reasons = judged(samples)
+    assert "the specific force is at the limit of the device" in reasons
+    assert np.flatnonzero(~used).tolist() == list(range(310, 320, 2))
 
 
 def test_blow_puts_the_setup_in_doubt() -> None:

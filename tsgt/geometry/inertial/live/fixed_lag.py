@@ -61,9 +61,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.inertial.bordered import BorderedCholesky
-    from tsgt.geometry.inertial.factors import (
-        InertialEquations,
-    )
+    from tsgt.geometry.inertial.factors import InertialEquations
+    from tsgt.geometry.inertial.live.saturation import SaturationMonitor
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
@@ -112,6 +111,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         mounting_factor: FloatArray | None = None,
         gyro_only: bool = False,
         odometry: OdometryParameters | None = None,
+        saturation: SaturationMonitor | None = None,
     ) -> None:
         super().__init__(InnovationMonitor(CONSISTENT_ALONE))
         self._noise = estimation_noise(imu.noise)
@@ -127,7 +127,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if not gyro_only:
             gravity = gravity.with_matrix(imu.noise.accelerometer_scale_misalignment, mounting.rotation[2])
         self._initial_gravity = self._gravity = gravity
-        self._health = HealthMonitor(imu)
+        self._health = HealthMonitor(imu, saturation)
         self._samples: InertialSamples | None = None
         self._rotation_predictor = RotationPredictor()
         self._stale_from_s = np.inf  # Samples after this have arrived since the integration

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.geometry.inertial.live.saturation import SaturationMonitor
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -25,18 +27,6 @@ STUCK_S = 0.1
 MAX_RATE_RADPS, MAX_FORCE_MPS2 = 40.0, 350.0
 """Beyond any measuring range (2000 deg/s and 32 g are 35 rad/s and 314 m/s^2): such values are no measurements."""
 
-LIMIT_SPAN_S = 0.5
-"""Samples among which values at the limit of an axis are looked for."""
-LIMIT_CHANCE = 1e-9
-"""Probability that as many values as show a limit are the same by chance: noise changes successive values by some of their steps."""
-MIN_CHANCE, STEP_SHARE = 1e-3, 0.5
-"""Probability that two values are the same: this share of their step over their noise, at least the first."""
-LIMIT_STEPS = 20  # On both sides of a limit, in which less than half as many values must be as at it
-MIN_MOTION_STEPS = 40  # Spread of values that change, so that repeated ones are none of a robot at rest
-MIN_LIMITS = np.repeat(
-    [0.04, 5.0], 3
-)  # Of angular rate and specific force, below which a robot at rest repeats values
-
 BLOW_MPS2 = 50.0
 """Specific force of a blow, on any axis: bumps and slopes give 15 m/s^2, a bracket that is knocked gives hundreds."""
 
@@ -46,9 +36,6 @@ DISAGREEMENT_S = 1.2  # Within which two prisms must disagree: each is measured 
 DISAGREES_WITH_PRISMS = "it disagrees with the prisms"
 """Reason of a disagreement that innovations show."""
 ALONE = 3  # Successive measurements of one prism that disagree, where none other is measured: it cannot be told from the IMU
-
-_MIN_REPEATED = 2  # A value that occurs no more often never shows a limit
-_ROUNDING = 1e-9  # Of the product with the gyro matrix, relative
 
 HOLD_S = 2.0
 """For which the samples must have been sound again: a few measurements of each prism, which have agreed with them."""
@@ -75,24 +62,19 @@ class HealthMonitor:
     prism that disagrees is an error of its station. Two that do within :data:`DISAGREEMENT_S` are an error of the IMU: the
     trajectory is as certain of one station as of the others.
 
-    An axis is at its limit where values repeat exactly that its motion and its noise ought to change: successive ones, or any
-    of the last half second.
+    ``saturation``: finds values at the limit of the device, and knows those limits that earlier monitors have met.
 
     ``setup_in_doubt``: the mounting may have changed, by a blow or whatever made the samples disagree with the prisms. ``blow``: by a
     blow.
     """
 
-    def __init__(self, imu: ImuParameters) -> None:
-        self._to_device = np.linalg.inv(np.array(imu.gyro_matrix))
-        self._densities = np.array([imu.noise.gyro_noise_density, imu.noise.accelerometer_noise_density])
+    def __init__(self, imu: ImuParameters, saturation: SaturationMonitor | None = None) -> None:
+        self._saturation = saturation or SaturationMonitor(imu)
         self._now_s = -np.inf
         self._newest_s = -np.inf
         self._problem = ""
         self._problem_s = -np.inf
         self.setup_in_doubt = self.blow = False
-        self._recent = np.empty((0, 6))  # Values of the device over the last half second
-        self._recent_s = np.empty(0)
-        self._steps = np.full(2, np.inf)  # Smallest change of angular rate and specific force
         self._same_s = 0.0
         self.stuck_from_s = np.inf  # The values have not changed since, for too long
         self._innovations: deque[tuple[float, int, bool]] = deque()
@@ -118,32 +100,19 @@ class HealthMonitor:
         sound &= (np.abs(rates).max(axis=1) < MAX_RATE_RADPS) & (np.abs(forces).max(axis=1) < MAX_FORCE_MPS2)
         if not sound.all():
             self._report("values beyond any measuring range", float(new.end_s[~sound][-1]))
-        # Of the device itself: the gyro matrix mixes the axes.
-        values = np.concatenate([rates @ self._to_device.T, forces], axis=1)
         blows: NDArray[np.bool_] = np.abs(forces).max(axis=1) > BLOW_MPS2
         blows &= sound
         if blows.any():
             self.setup_in_doubt = self.blow = True
             self._report("a blow may have displaced it", float(new.end_s[blows][-1]))
-        before = len(self._recent)
-        values = np.concatenate([self._recent, values])
-        same = np.zeros(values.shape, np.bool_)
-        changes = np.abs(values[1:] - values[:-1])
-        # Of a sensor as a whole: the product mixes its axes, of which one may be zero.
-        largest = np.abs(values.reshape(-1, 2, 3)).max(axis=2)
-        largest = np.maximum(largest[1:], largest[:-1])
-        same[1:] = (changes.reshape(-1, 2, 3) <= _ROUNDING * largest[:, :, None]).reshape(-1, 6)
-        self._check_stuck(new, np.logical_and.reduce(same[before:], axis=1))
-        at_limit = self._at_limit(values, same, changes, new.duration_s)[before:]
+        unchanged, at_limit = self._saturation.samples(new)
+        self._check_stuck(new, unchanged)
         for sensor, columns in (("angular rate", slice(0, 3)), ("specific force", slice(3, 6))):
             rows = np.flatnonzero(at_limit[:, columns].any(axis=1))
             if len(rows):
                 self._report(f"the {sensor} is at the limit of the device", float(new.end_s[rows[-1]]))
         self._newest_s = max(self._newest_s, float(new.end_s[-1]))
         self._now_s = max(self._now_s, self._newest_s)
-        times_s = np.concatenate([self._recent_s, new.end_s])
-        kept = np.flatnonzero((times_s > times_s[-1] - LIMIT_SPAN_S) & np.isfinite(values).all(axis=1))
-        self._recent, self._recent_s = values[kept], times_s[kept]
         sound &= ~(blows | at_limit.any(axis=1))
         return sound
 
@@ -157,51 +126,6 @@ class HealthMonitor:
             if self._same_s >= STUCK_S:
                 self.stuck_from_s = min(self.stuck_from_s, float(new.end_s[row]) - self._same_s)
                 self._report("it repeats the same values", float(new.end_s[row]))
-
-    def _at_limit(
-        self, values: FloatArray, same: NDArray[np.bool_], changes: FloatArray, duration_s: FloatArray
-    ) -> NDArray[np.bool_]:
-        """Which values, (M, 6), are at the limit of their axis; ``same``: as the one before; ``changes``, (M - 1, 6): from it."""
-        changes = np.where(same[1:], np.inf, changes)
-        self._steps = np.fmin(self._steps, changes.reshape(-1, 2, 3).min(axis=(0, 2), initial=np.inf))
-        found = np.zeros(values.shape, np.bool_)
-        stuck = np.logical_and.reduce(same, axis=1, keepdims=True)
-        same &= ~stuck
-        most = _most_frequent(values[~stuck[:, 0]])
-        if most.max() <= _MIN_REPEATED and not same.any():
-            return found
-        chance = STEP_SHARE * self._steps * np.sqrt(float(np.median(duration_s))) / self._densities
-        log_chance = np.minimum(np.log(np.maximum(chance, MIN_CHANCE)), -1e-9)
-        # As often as chance does not repeat a value.
-        repeated = np.repeat(np.log(LIMIT_CHANCE) / log_chance, 3)
-        rows = np.arange(len(values))[:, None]
-        # Of the run of values that are the same.
-        begin = np.maximum.accumulate(np.where(same, 0, rows), axis=0)
-        long = rows - begin >= repeated
-        often = most > np.maximum(repeated, _MIN_REPEATED)
-        if not (long.any() or often.any()):
-            return found
-        steps = np.repeat(self._steps, 3)
-        moves = np.ptp(values, axis=0) > MIN_MOTION_STEPS * steps
-        # The accelerometer's vertical axis is far from zero at rest.
-        others_move = np.ones(6, np.bool_)
-        others_move[3:] = moves[[4, 3, 3]] | moves[[5, 5, 4]]
-        long &= (np.abs(values) > MIN_LIMITS) & others_move
-        for axis in np.flatnonzero(long.any(axis=0)):
-            found[:, axis] = np.isin(begin[:, axis], begin[long[:, axis], axis])
-        for axis in np.flatnonzero(moves & often):
-            changing = values[~stuck[:, 0], axis]
-            ordered = np.sort(changing)
-            ends = np.flatnonzero(np.diff(ordered, append=np.inf) > _ROUNDING * np.abs(ordered))
-            counts = np.diff(ends, prepend=-1)
-            run = int(np.argmax(counts))
-            value, count = ordered[ends[run]], int(counts[run])
-            if abs(value) < MIN_LIMITS[axis]:
-                continue
-            near = int(np.count_nonzero(np.abs(changing - value) <= LIMIT_STEPS * steps[axis])) - count
-            if count > 2 * near:
-                found[:, axis] |= np.abs(values[:, axis] - value) <= _ROUNDING * abs(value)
-        return found
 
     def innovations(self, time_s: FloatArray, prism: NDArray[np.intp], nis: FloatArray) -> bool:
         """Judge the normalised innovations squared of new measurements; return whether the samples disagree with them."""
@@ -223,13 +147,3 @@ class HealthMonitor:
     def _report(self, problem: str, time_s: float) -> None:
         self._now_s = max(self._now_s, time_s)
         self._problem, self._problem_s = problem, max(self._problem_s, time_s)
-
-
-def _most_frequent(values: FloatArray) -> NDArray[np.intp]:
-    """How often the most frequent value of each column of (M, C) occurs, (C,)."""
-    ordered = np.sort(values, axis=0)
-    differs = np.diff(ordered, axis=0) > _ROUNDING * np.abs(ordered[:-1])
-    rows = np.arange(1, len(values))[:, None]
-    before = np.maximum.accumulate(np.where(differs, rows, 0), axis=0)
-    found: NDArray[np.intp] = (rows - before).max(axis=0, initial=0) + 1
-    return found

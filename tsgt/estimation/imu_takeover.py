@@ -17,7 +17,6 @@ from tsgt.estimation.inertial import SampleConverter
 from tsgt.estimation.odometry import WheelConverter
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial import DISAGREES_WITH_PRISMS
-from tsgt.geometry.trajectory import AMBIGUITY_MARGIN_S
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
@@ -64,7 +63,7 @@ UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 """
 
 _POSE_DIM = 6
-_AFTER_FIRST_S = 0.01  # Sooner than the next measurement of a prism
+_SIMULTANEOUS_S = 0.01  # Sooner than the next measurement of a prism
 
 MAX_NIS, MAX_LASTING_NIS = 60.0, 30.0
 """Squared distance of the poses with IMU from those without, in sigmas of the latter, at once and in two checks half a second
@@ -174,6 +173,11 @@ class InertialWindow(TrajectoryWindow, Protocol):
         ...
 
     @property
+    def followed_for_s(self) -> float:
+        """Time over which the trajectory has followed inconsistent measurements, once they are consistent again."""
+        ...
+
+    @property
     def blow(self) -> bool:
         """Whether a blow may have displaced it."""
         ...
@@ -241,7 +245,7 @@ class ImuTakeover:
         self._create_with = create_with
         self._setup, self._prisms = setup, prisms
         self._established = self.station_contradicted = False
-        self._ambiguous_from_s = np.inf  # of the trajectory with the IMU
+        self._was_ambiguous = False  # The trajectory with the IMU
         self._with = create_with()
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
@@ -389,13 +393,11 @@ class ImuTakeover:
         )
         followed = False
         if self._with.ambiguous:
-            self._ambiguous_from_s = min(self._ambiguous_from_s, self._with.ambiguous_from_s)
+            self._was_ambiguous = True
         elif self._with.converged:
-            if np.isfinite(self._ambiguous_from_s):
-                # From before the first that contradicted to the last: one in a thousand does so by chance, and no other.
-                after_first_s = self._ambiguous_from_s + AMBIGUITY_MARGIN_S + _AFTER_FIRST_S
-                followed = bool(self._with.ambiguous_at(np.array([after_first_s]))[0])
-            self._ambiguous_from_s = np.inf
+            # One in a thousand is inconsistent by chance, and no other.
+            followed = self._was_ambiguous and self._with.followed_for_s > _SIMULTANEOUS_S
+            self._was_ambiguous = False
         self.station_contradicted |= self._established and (followed or rejected)
         self._established |= self._with.converged and not self._with.ambiguous
 

@@ -24,7 +24,8 @@ class InnovationMonitor:
 
     A station on a wrong prism agrees with itself, and a trajectory that is bent by a wrong measurement may happen to fit the next
     one of a single prism. ``inconsistent_prisms``: whose inconsistent measurements are not resolved yet. ``alone``: as many
-    consistent measurements in succession of one prism resolve an ambiguity without other prisms.
+    consistent measurements in succession of one prism resolve an ambiguity without other prisms. ``followed_for_s``: time from the
+    first to the last inconsistent measurement of the newest ambiguity, once it is resolved and the trajectory has followed them.
     """
 
     def __init__(self, alone: int | None = None) -> None:
@@ -33,8 +34,13 @@ class InnovationMonitor:
         self._consistent_prisms: frozenset[int] = frozenset()  # since the last inconsistent measurement
         self.inconsistent_prisms: frozenset[int] = frozenset()
         self._inconsistent_from_s = np.inf
-        self._flagged = np.empty(0, np.bool_)
+        self._flagged = self._outliers = np.empty(0, np.bool_)
+        self._time_s = np.empty(0)
+        self._left_s: list[
+            float
+        ] = []  # First and last time of flagged inliers that have left the window since
         self._ambiguous_intervals_s: list[tuple[float, float]] = []
+        self.followed_for_s = 0.0
 
     @property
     def ambiguous_from_s(self) -> float:
@@ -55,9 +61,12 @@ class InnovationMonitor:
     def reset(self, observations: Observations) -> None:
         """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
-        self._flagged = np.zeros(len(observations), np.bool_)
+        self._flagged = self._outliers = np.zeros(len(observations), np.bool_)
+        self._time_s = observations.time_s
         self._consistent_prisms = frozenset()
         self._succession = 0
+        self._left_s.clear()
+        self.followed_for_s = 0.0
 
     def set_start(self, time_s: float) -> None:
         """Start the ambiguity after the measurements of the initialised trajectory."""
@@ -65,7 +74,12 @@ class InnovationMonitor:
 
     def select(self, rows: NDArray[np.bool_]) -> None:
         """Drop the other measurements of the window."""
-        self._flagged = self._flagged[rows]
+        left_s = self._time_s[self._flagged & ~self._outliers & ~rows]
+        if len(left_s):
+            times_s = [*self._left_s, *left_s.tolist()]
+            self._left_s = [min(times_s), max(times_s)]
+        self._flagged, self._outliers = self._flagged[rows], self._outliers[rows]
+        self._time_s = self._time_s[rows]
 
     def discard_before(self, before_s: float) -> None:
         """Drop ambiguous intervals that ended long before a time."""
@@ -88,7 +102,7 @@ class InnovationMonitor:
         flagged[~is_new] = self._flagged
         # Measurements that arrive together may each pass the gate and yet be mutually inconsistent.
         flagged[is_new] = inconsistent | outliers[is_new]
-        self._flagged = flagged
+        self._flagged, self._outliers, self._time_s = flagged, outliers, observations.time_s
         rows = (
             observations.time_s[is_new].tolist(),
             observations.prism[is_new].tolist(),
@@ -112,14 +126,16 @@ class InnovationMonitor:
         if followed:
             self.inconsistent_prisms |= followed
             self._consistent_prisms = frozenset()
-        if not self.inconsistent_prisms and flagged.any():
+        if not self.inconsistent_prisms and (flagged.any() or self._left_s):
             self._resolve(observations, outliers)
 
     def _resolve(self, observations: Observations, outliers: NDArray[np.bool_]) -> None:
         """Record the interval of an ambiguity that has just ended, unless its flagged measurements were rejected."""
-        flagged = self._flagged
+        flagged, followed_s = self._flagged, self._left_s
         single_prism = len(np.unique(observations.prism[flagged])) == 1
-        if not (single_prism and outliers[flagged].all()):
+        if flagged.any() and not (single_prism and outliers[flagged].all()):
             times_s = observations.time_s[flagged]
             self._ambiguous_intervals_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
-        self._flagged = np.zeros_like(flagged)
+            followed_s = [*followed_s, float(times_s[0]), float(times_s[-1])]
+        self.followed_for_s = max(followed_s) - min(followed_s) if followed_s else 0.0
+        self._flagged, self._left_s = np.zeros_like(flagged), []

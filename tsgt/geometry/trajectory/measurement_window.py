@@ -109,6 +109,11 @@ class MeasurementWindow(ABC):
         """Whether the state was ambiguous up to :data:`AMBIGUITY_MARGIN_S` before times (N,)."""
         return self._monitor.ambiguous_at(time_s, margin_s=AMBIGUITY_MARGIN_S)
 
+    @property
+    def followed_for_s(self) -> float:
+        """Time over which the trajectory has followed inconsistent measurements, once they are consistent; see :class:`InnovationMonitor`."""
+        return self._monitor.followed_for_s
+
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
         held, self.observations = self.observations, merge_observations(self.observations, new)

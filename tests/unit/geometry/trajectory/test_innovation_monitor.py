@@ -25,16 +25,27 @@ def _observations(*prisms: int) -> Observations:
     )
 
 
-def _is_ambiguous_after(text: str, *, alone: int | None = None) -> bool:
-    """Follow measurements: ``a``, ``b`` and ``c`` are consistent ones of three prisms, capitals inconsistent ones."""
+def _monitor_after(
+    text: str, *, alone: int | None = None, followed: bool = False, window: int = 99
+) -> InnovationMonitor:
+    """Follow measurements after a start: ``a``, ``b`` and ``c`` are consistent ones of three prisms, capitals inconsistent ones."""
     monitor = InnovationMonitor(alone)
-    prisms = ["abc".index(each.lower()) for each in text]
-    for row, each in enumerate(text):
-        held = _observations(*prisms[: row + 1])
-        inconsistent = np.array([each.isupper()])
-        outliers = np.array([other.isupper() for other in text[: row + 1]])
-        monitor.update(held, np.arange(row + 1) == row, inconsistent, outliers)
-    return bool(monitor.inconsistent_prisms)
+    start = [0, 1]
+    prisms = [*start, *("abc".index(each.lower()) for each in text)]
+    wrong = np.array([False, False, *(each.isupper() for each in text)])
+    monitor.reset(_observations(*start))
+    monitor.set_start(0.1)
+    for row in range(len(start), len(prisms)):
+        rows = slice(max(0, row + 1 - window), row + 1)
+        held = _observations(*prisms[: row + 1]).select(rows)
+        outliers = wrong[rows] & (not followed)
+        monitor.update(held, np.arange(len(held)) == len(held) - 1, wrong[row : row + 1], outliers)
+        monitor.select(np.arange(len(held)) > len(held) - window)
+    return monitor
+
+
+def _is_ambiguous_after(text: str, *, alone: int | None = None) -> bool:
+    return bool(_monitor_after(text, alone=alone).inconsistent_prisms)
 
 
 @pytest.mark.parametrize("text", ["A", "Aaaaa", "Ab", "ABc", "AbC", "AbCc", "ABcccc"])
@@ -53,3 +64,29 @@ def test_two_consistent_prisms_resolve(text: str) -> None:
 def test_single_prism_resolves_by_its_succession(text: str, *, ambiguous: bool) -> None:
     """Where there is no other prism."""
     assert _is_ambiguous_after(text, alone=3) is ambiguous
+
+
+@pytest.mark.parametrize(
+    ("text", "followed", "for_s"),
+    [
+        ("Abc", True, 0.0),
+        ("AaAbc", True, 0.2),
+        ("AaAb", True, 0.0),
+        ("AaAbc", False, 0.0),
+        ("AaAbcAbc", True, 0.0),
+        ("aAbc", True, 0.0),
+    ],
+)
+def test_time_over_which_inconsistent_measurements_are_followed(
+    text: str, for_s: float, *, followed: bool
+) -> None:
+    """Of the newest ambiguity, once it is resolved: one alone, or some that are rejected, are none, however early after a start."""
+    assert _monitor_after(text, followed=followed).followed_for_s == pytest.approx(for_s)
+
+
+@pytest.mark.parametrize(("followed", "for_s"), [(True, 0.2), (False, 0.0)])
+def test_followed_measurements_that_have_left_the_window_count(for_s: float, *, followed: bool) -> None:
+    """A single prism resolves an ambiguity when the window has moved on."""
+    monitor = _monitor_after("AAAaaaaa", alone=5, followed=followed, window=4)
+    assert not monitor.inconsistent_prisms
+    assert monitor.followed_for_s == pytest.approx(for_s)

@@ -45,7 +45,8 @@ SOUND_S = 1.0
 
 QUARANTINE_S, MAX_QUARANTINE_S = 4.0, 64.0
 """How long an IMU that disagreed must have been sound: until the window holds nothing from before, and each time twice as long if it
-disagrees again within :data:`PROVEN_S` of use.
+disagrees again within :data:`PROVEN_S` of use. It stays as long where the samples have shown by themselves what was wrong and when that
+had passed, and there are no poses without them.
 """
 PROVEN_S = 60.0
 
@@ -361,7 +362,9 @@ class ImuTakeover:
                 self._setup.restart(blow=self._with.blow)
             if self.use == ImuUse.USED:
                 again = now_s - self._used_from_s < PROVEN_S
-                self._quarantine_s = min(2 * self._quarantine_s, MAX_QUARANTINE_S) if again else 0.0
+                # Less than three prisms have no poses meanwhile.
+                longer = 2 if doubt or self._prisms >= MIN_PRISMS else 1
+                self._quarantine_s = min(longer * self._quarantine_s, MAX_QUARANTINE_S) if again else 0.0
             self._contradicted_from_s, self._nis, self._contradiction = np.inf, (0.0, 0.0), ""
             self._with = self._create_with()
             self._quarantine_s = max(self._quarantine_s, QUARANTINE_S)

@@ -298,6 +298,9 @@ class ContinuousEstimator:
                 batch.reason[batch.valid] = Reason.CONTRADICTED
                 batch.degraded[:] = 0
             if self._imu.unconfirmed:
+                # Over an outage what is wrong in the set-up grows far beyond the allowance.
+                unseen = batch.valid & (batch.prism_reason != int(Reason.VALID)).all(axis=1)
+                batch.reason[unseen], batch.degraded[unseen] = Reason.OUTAGE, 0
                 batch.degraded[batch.valid] |= Degradation.IMU_UNCONFIRMED
         return batch
 

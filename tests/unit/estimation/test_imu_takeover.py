@@ -381,6 +381,23 @@ def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
     assert (np.sqrt(added[:3]) >= 0.0049).all()
 
 
+def test_outage_of_all_prisms_with_an_unconfirmed_imu(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is wrong in the set-up grows with time: there are no valid poses beyond the outage limit, which a confirmed one has."""
+    pipeline = replace(scene.parameters.pipeline, outage_limit_ns=3 * SECOND // 10)
+    scene = replace(scene, parameters=replace(scene.parameters, pipeline=pipeline))
+    last_ns = START + 5 * SECOND // 2
+    arrived = [
+        each for each in arrivals(scene, 3.2) if isinstance(each, ImuSamples) or each.stamp_ns < last_ns
+    ]
+
+    def in_outage() -> list[PoseRecord]:
+        return [each for each in predicted(records(scene, arrived)) if time_of(each) > 2.85]
+
+    assert any(each.valid for each in in_outage())
+    monkeypatch.setattr(ImuTakeover, "unconfirmed", True)
+    assert {(each.valid, each.reason) for each in in_outage()} == {(False, "outage")}
+
+
 STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
 
 

@@ -11,6 +11,7 @@ from tsgt.estimation import build_tracks, centroid_at_point, centroid_m, transfo
 from tsgt.geometry import invert, log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MIN_PRISMS
 from tsgt.simulation.checks.poses.apparent import apparent_poses, misfit_tolerances
+from tsgt.simulation.checks.poses.late_stamps import late_stamp_tolerances
 from tsgt.simulation.faults import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD
 
 if TYPE_CHECKING:
@@ -78,7 +79,8 @@ def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]
     poses = replace(poses, covariance=displaced_covariance(poses.covariance, untold, result.parameters))
     errors, nees, misfits = _errors(poses, master_log, result)
     error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
-    limits = _STATE_TOLERANCE + untold + misfits
+    at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
+    limits = _STATE_TOLERANCE + untold + misfits + late_stamp_tolerances(result, at_s)
     for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms > limits).any(axis=1)).tolist():
         yield (
             f"{poses.series[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "
@@ -142,6 +144,8 @@ def distribution_failures(master_log: MasterLog, result: MissionResult) -> Itera
     every = master_log.valid_poses()
     told = untold_displacements(every, master_log, result)[:, 1] == 0.0
     told &= _errors(every, master_log, result)[2][:, 0] <= MAX_MISFIT_M
+    every_s = (every.stamp_ns - master_log.unix_at_zero_ns) / 1e9
+    told &= late_stamp_tolerances(result, every_s)[:, 0] == 0.0
     every = every.select(told)
     for series in np.unique(every.series).tolist():
         poses = every.select(every.series == series)

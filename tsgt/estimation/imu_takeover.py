@@ -64,7 +64,7 @@ UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 """
 
 _POSE_DIM = 6
-_SIMULTANEOUS_S = 0.01  # Sooner than the next measurement of a prism
+_SIMULTANEOUS_S = 0.01  # Measurements of one prism are further apart
 
 MAX_NIS, MAX_LASTING_NIS = 60.0, 30.0
 """Squared distance of the poses with IMU from those without, in sigmas of the latter, at once and in two checks half a second
@@ -362,7 +362,7 @@ class ImuTakeover:
                 self._setup.restart(blow=self._with.blow)
             if self.use == ImuUse.USED:
                 again = now_s - self._used_from_s < PROVEN_S
-                # Less than three prisms have no poses meanwhile.
+                # With fewer than three prisms there are no poses meanwhile.
                 longer = 2 if doubt or self._prisms >= MIN_PRISMS else 1
                 self._quarantine_s = min(longer * self._quarantine_s, MAX_QUARANTINE_S) if again else 0.0
             self._contradicted_from_s, self._nis, self._contradiction = np.inf, (0.0, 0.0), ""

@@ -66,8 +66,8 @@ class InertialAnchor:
         found[_ROTATION, _ROTATION] = inverse_right_jacobian((error + self.mean)[_ROTATION])
         return found
 
-    def pull(self, displacement: FloatArray) -> FloatArray:
-        """(D + S, r) negative gradient by the states if the states of the mean are displaced by (D + S, r), at the linearisation point."""
+    def weighted_displacement(self, displacement: FloatArray) -> FloatArray:
+        """(D + S, r) information times the displacement of the states that are the mean, (D + S, r); both of the IMU's origin."""
         by_error = _by_state(self.linearisation_point, self.point, self.rate, len(displacement))
         return by_error.T @ self.information @ by_error @ displacement
 

@@ -78,7 +78,7 @@ class InertialSensitivity:
         )
         shared = np.zeros((factor.border.shape[2], by_setup.shape[2]))
         if anchor is not None and anchor_displacement is not None:
-            by_anchor = anchor.pull(anchor_displacement)
+            by_anchor = anchor.weighted_displacement(anchor_displacement)
             mixed[0] -= by_anchor[:size]
             shared -= by_anchor[size:]
         displaced, shared_displaced = factor.solve(mixed, shared)

@@ -36,9 +36,8 @@ class InnovationMonitor:
         self._inconsistent_from_s = np.inf
         self._flagged = self._outliers = np.empty(0, np.bool_)
         self._time_s = np.empty(0)
-        self._left_s: list[
-            float
-        ] = []  # First and last time of flagged inliers that have left the window since
+        # First and last time of flagged inliers that have left the window since
+        self._left_s: list[float] = []
         self._ambiguous_intervals_s: list[tuple[float, float]] = []
         self.followed_for_s = 0.0
 

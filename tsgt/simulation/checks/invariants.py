@@ -130,7 +130,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
         found += timestamp_violations(
             master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)
         )
-        found += (Violation("pose", what) for what in pose_failures(master_log, in_force))
+        found += (Violation("pose", what) for what in pose_failures(master_log, in_force, indices))
         if replay:
             found += replay_mismatches(master_log)
     found += (Violation("imu", what) for what in imu_failures(result))

@@ -61,7 +61,9 @@ def test_small_errors_cost_the_same_about_any_point() -> None:
 
     assert cost(about_point) == pytest.approx(cost(origin), rel=1e-6)
     displacement = rng.normal(size=(17, 4))
-    np.testing.assert_allclose(about_point.pull(displacement), origin.pull(displacement), rtol=1e-9)
     np.testing.assert_allclose(
-        origin.pull(displacement), origin.information @ displacement, rtol=1e-9, atol=1e-9
+        about_point.weighted_displacement(displacement), origin.weighted_displacement(displacement), rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        origin.weighted_displacement(displacement), origin.information @ displacement, rtol=1e-9, atol=1e-9
     )

@@ -281,14 +281,14 @@ def test_overconfident_or_biased_poses_are_detected(
     """Poses with a sixteenth of the covariance, or all of them with an error of 10 mm."""
     monkeypatch.setattr(consistency, "_MIN_POSES", 300)
     session = result.master_logs[0]
-    assert list(consistency.distribution_failures(session, result)) == []
+    assert list(consistency.distribution_failures(session, result, {})) == []
     numbers = np.array(session._pose_numbers).reshape(-1, 52)
     if part.start:
         numbers[:, part] /= 16
     else:
         numbers[:, part] += 0.01
     session._pose_numbers = array("d", numbers.ravel())
-    assert list(consistency.distribution_failures(session, result))
+    assert list(consistency.distribution_failures(session, result, {}))
 
 
 def test_unrecorded_line_is_detected(result: MissionResult) -> None:

@@ -19,17 +19,29 @@ def _poses(at_s: np.ndarray) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(("starts", "late"), [(1, False), (2, True)])
-def test_only_a_restarted_client_of_a_slow_instrument_is_late(starts: int, *, late: bool) -> None:
-    """From when it is slow on, by the way that the robot drives meanwhile."""
+def _index(*begins_s: int) -> Any:
+    """Return journals that begin at times of an instrument that is four times as slow from 60 s to 80 s."""
     reported = [
-        SimpleNamespace(true_ns=t * 1_000_000_000, slowed_by=4.0 if t >= 60 else 1.0) for t in range(90)
+        SimpleNamespace(true_ns=time_s * 1_000_000_000, slowed_by=4.0 if 60 <= time_s < 80 else 1.0)
+        for time_s in range(120)
     ]
-    station = SimpleNamespace(reported_distances=reported, journals=["a"] * starts)
-    prism = SimpleNamespace(position_m=(0.1, 0.2, 1.0))
-    result: Any = SimpleNamespace(
-        station_logs={1: station}, parameters=SimpleNamespace(prisms=[prism]), true_poses=_poses
+    return SimpleNamespace(
+        station_log=SimpleNamespace(reported_distances=reported),
+        journalled_by_start=[[begin_s, begin_s + 1] for begin_s in begins_s],
+        true_ns=lambda time_s: time_s * 1_000_000_000,
     )
-    found = late_stamp_tolerances(result, np.array([50.0, 70.0]))
-    expected_m = 3.0 * LATE_S * SPEED_MPS if late else 0.0
-    np.testing.assert_allclose(found, [[0.0, 0.0], [expected_m, 0.0]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("begins_s", "late"),
+    [((5,), [0, 0, 0]), ((5, 70), [0, 1, 1]), ((5, 70, 90), [0, 1, 0]), ((5, 90), [0, 0, 0])],
+)
+def test_only_a_client_that_began_while_the_instrument_was_slow_is_late(
+    begins_s: tuple[int, ...], late: list[int]
+) -> None:
+    """By the way that the robot drives meanwhile, until the client is restarted."""
+    prism = SimpleNamespace(position_m=(0.1, 0.2, 1.0))
+    result: Any = SimpleNamespace(parameters=SimpleNamespace(prisms=[prism]), true_poses=_poses)
+    found = late_stamp_tolerances(result, [_index(*begins_s)], np.array([50.0, 75.0, 100.0]))
+    np.testing.assert_allclose(found[:, 0], 3.0 * LATE_S * SPEED_MPS * np.array(late), atol=1e-9)
+    np.testing.assert_allclose(found[:, 1], 0.0, atol=1e-9)

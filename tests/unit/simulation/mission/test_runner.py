@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import QUICK, SUPERFRAME, run_mission
+from harness.missions import QUICK, SUPERFRAME, linear_drive, run_mission
 
 from tsgt.cli.simulate.figures import figures, frame_ms, outage_figures, station_figures
 from tsgt.cli.simulate.poses import estimator_figures
@@ -41,12 +41,6 @@ def test_classic_mission(tmp_path: Path) -> None:
     assert poses.against_truth.orientation_rms_deg < 2
 
 
-def with_linear_estimator(scenario: ScenarioConfig) -> ScenarioConfig:
-    """Return a scenario with the paper's estimator."""
-    pipeline = scenario.pipeline.model_copy(update={"estimator": "linear"})
-    return scenario.model_copy(update={"pipeline": pipeline})
-
-
 @pytest.mark.parametrize(
     ("station_software", "min_hz", "max_hz"), [("ours", 1.5, 1.72), ("authors", 1.3, 1.6)]
 )
@@ -55,7 +49,7 @@ def test_rates_with_the_papers_settings(
     tmp_path: Path, station_software: StationSoftware, min_hz: float, max_hz: float
 ) -> None:
     """Airtime limits three stations to 1.72 Hz each; the paper measured about 1.4 Hz."""
-    scenario = with_linear_estimator(find_scenario("dynamic"))
+    scenario = linear_drive()
     run = run_mission(
         tmp_path,
         scenario,
@@ -96,9 +90,7 @@ def test_authors_node(tmp_path: Path) -> None:
 
     The master subtracts their mean ping delay: half a polling interval and seven transfers.
     """
-    run = run_mission(
-        tmp_path, with_linear_estimator(find_scenario("dynamic")), duration_s=40.0, station_software="authors"
-    )
+    run = run_mission(tmp_path, linear_drive(), duration_s=40.0, station_software="authors")
     assert check_invariants(run) == []
     samples = [sample for clock in run.master_logs[0].clocks for sample in clock.samples]
     timing = AuthorsTiming()
@@ -305,7 +297,7 @@ def test_paper_filter_lags(tmp_path: Path) -> None:
     paper = QUICK.model_copy(update={"clock_filter": "paper", "resync_interval_s": 20.0})
     run = run_mission(
         tmp_path,
-        with_linear_estimator(find_scenario("dynamic")),
+        linear_drive(),
         duration_s=120.0,
         drift_ppm=50.0,
         protocol=paper,

@@ -15,13 +15,13 @@ from tsgt.simulation.checks.poses.late_stamps import late_stamp_tolerances
 from tsgt.simulation.faults import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
     from tsgt.estimation import Track
     from tsgt.model import Parameters
-    from tsgt.simulation.mission import MasterLog, MissionResult, ValidPoses
+    from tsgt.simulation.mission import JournalIndex, MasterLog, MissionResult, ValidPoses
 
 # Above the latency of any station, which is subtracted from the timestamps.
 _MAX_LATENCY_NS = 5_000_000_000
@@ -44,11 +44,13 @@ MAX_MISFIT_M = 0.001
 """Poses are not in the medians if moved stations distort the prisms' triangle by more."""
 
 
-def pose_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+def pose_failures(
+    master_log: MasterLog, result: MissionResult, indices: Mapping[int, JournalIndex]
+) -> Iterator[str]:
     """Yield the inconsistent valid poses of a master's process, one line each."""
     yield from refit_mismatches(master_log, master_log.parameters or result.parameters)
-    yield from nees_outliers(master_log, result)
-    yield from distribution_failures(master_log, result)
+    yield from nees_outliers(master_log, result, indices)
+    yield from distribution_failures(master_log, result, indices)
 
 
 def refit_mismatches(master_log: MasterLog, parameters: Parameters) -> Iterator[str]:
@@ -71,7 +73,9 @@ def refit_mismatches(master_log: MasterLog, parameters: Parameters) -> Iterator[
             )
 
 
-def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+def nees_outliers(
+    master_log: MasterLog, result: MissionResult, indices: Mapping[int, JournalIndex]
+) -> Iterator[str]:
     """Compare each valid pose of the estimator ``continuous`` with the truth and its covariance (NEES)."""
     poses = master_log.valid_poses()
     poses = poses.select((poses.series != "interpolated") & ~rolls_over_unseen(poses, master_log, result))
@@ -80,7 +84,7 @@ def nees_outliers(master_log: MasterLog, result: MissionResult) -> Iterator[str]
     errors, nees, misfits = _errors(poses, master_log, result)
     error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
     at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
-    limits = _STATE_TOLERANCE + untold + misfits + late_stamp_tolerances(result, at_s)
+    limits = _STATE_TOLERANCE + untold + misfits + late_stamp_tolerances(result, indices.values(), at_s)
     for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms > limits).any(axis=1)).tolist():
         yield (
             f"{poses.series[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "
@@ -132,7 +136,9 @@ def displaced_covariance(
     return np.asarray(covariance + sigmas[:, None] ** 2 * np.eye(6))
 
 
-def distribution_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
+def distribution_failures(
+    master_log: MasterLog, result: MissionResult, indices: Mapping[int, JournalIndex]
+) -> Iterator[str]:
     """Compare the medians of error and NEES of each kind of pose with their limits.
 
     Chance can explain a single pose, but not the median; and a median error over half a minute, with a robot that turns,
@@ -145,7 +151,7 @@ def distribution_failures(master_log: MasterLog, result: MissionResult) -> Itera
     told = untold_displacements(every, master_log, result)[:, 1] == 0.0
     told &= _errors(every, master_log, result)[2][:, 0] <= MAX_MISFIT_M
     every_s = (every.stamp_ns - master_log.unix_at_zero_ns) / 1e9
-    told &= late_stamp_tolerances(result, every_s)[:, 0] == 0.0
+    told &= late_stamp_tolerances(result, indices.values(), every_s)[:, 0] == 0.0
     every = every.select(told)
     for series in np.unique(every.series).tolist():
         poses = every.select(every.series == series)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, pairwise
+from math import inf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,27 +11,28 @@ import numpy as np
 from tsgt.geometry import log_so3
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from numpy.typing import NDArray
 
-    from tsgt.simulation.mission import MissionResult
+    from tsgt.simulation.mission import JournalIndex, MissionResult
 
 LATE_S = 0.03
-"""Of stamps by a client that began while its instrument was slower than usual, times by how much it was: 70 ms are seen where
-responses take four times as long. Nothing tells the client (docs/explanation/instrument-time.md).
+"""Delay of the stamps of a client that began while responses took k times as long as usual, over k - 1: 70 ms are seen where k is
+four. Nothing tells the client (docs/explanation/instrument-time.md).
 """
 
 _HALF_STEP_S = 0.05  # Of the differences that give the robot's speed
 
 
-def late_stamp_tolerances(result: MissionResult, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def late_stamp_tolerances(
+    result: MissionResult, indices: Iterable[JournalIndex], at_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """By how much poses at true times, (N,), may be late: in m at the prisms' centroid and in rad, (N, 2)."""
     late_s = np.zeros(len(at_s))
-    for station_log in result.station_logs.values():
-        slow = [each for each in station_log.reported_distances if each.slowed_by > 1.0]
-        if slow and len(station_log.journals) > 1:
-            factor = max(each.slowed_by for each in slow)
-            since_s = min(each.true_ns for each in slow) / 1e9
-            late_s = np.maximum(late_s, np.where(at_s >= since_s, LATE_S * (factor - 1.0), 0.0))
+    for index in indices:
+        for from_s, to_s, delay_s in _late_stamps(index):
+            late_s[(at_s >= from_s) & (at_s < to_s)] = delay_s
     tolerances = np.zeros((len(at_s), 2))
     if late_s.any():
         before, after = result.true_poses(at_s - _HALF_STEP_S), result.true_poses(at_s + _HALF_STEP_S)
@@ -43,3 +45,18 @@ def late_stamp_tolerances(result: MissionResult, at_s: NDArray[np.float64]) -> N
             arm_m = min(float(np.linalg.norm(a - b)) for a, b in combinations(prisms_m, 2))
             tolerances[:, 1] += tolerances[:, 0] / arm_m
     return tolerances
+
+
+def _late_stamps(index: JournalIndex) -> Iterator[tuple[float, float, float]]:
+    """Yield begin, end and delay of the stamps of each client that began while its instrument was slower, in s."""
+    reported = index.station_log.reported_distances
+    measured_ns = [each.true_ns for each in reported]
+    begins_ns = sorted(
+        min(times_ns)
+        for measurements in index.journalled_by_start
+        if (times_ns := [time for each in measurements if (time := index.true_ns(each)) is not None])
+    )
+    for from_ns, to_ns in pairwise([*begins_ns, inf]):
+        row = int(np.searchsorted(measured_ns, from_ns, side="right")) - 1
+        if row >= 0 and (slowed_by := reported[row].slowed_by) > 1.0:
+            yield from_ns / 1e9, to_ns / 1e9, LATE_S * (slowed_by - 1.0)

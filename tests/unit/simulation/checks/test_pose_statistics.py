@@ -104,10 +104,10 @@ def test_too_large_covariance_is_detected(stated: float, count: int) -> None:
     assert len(found) == count
 
 
-def _check_twists(**changes: Any) -> list[str]:
+def _check_twists(series: str = "smoothed", **changes: Any) -> list[str]:
     """Return what is found in poses whose velocities are changed."""
     log, result, _ = _drive()
-    poses = log.valid_poses()
+    poses = replace(log.valid_poses(), series=np.full(len(log.valid_poses().stamp_ns), series))
     ahead, behind = (_pose_at((poses.stamp_ns - START) / 1e9 + step_s) for step_s in (0.01, -0.01))
     velocity = (ahead[:, :3, 3] - behind[:, :3, 3]) / 0.02
     columns = {
@@ -126,6 +126,17 @@ def test_wrong_velocity_is_detected() -> None:
     assert _check_twists(velocity_mps=lambda velocity: np.roll(velocity, 1, axis=1))
     assert _check_twists(velocity_mps=lambda velocity: 0.8 * velocity)
     assert _check_twists(angular_velocity_radps=lambda rate: -rate)
+
+
+@pytest.mark.parametrize(("series", "detected"), [("smoothed", True), ("interpolated", False)])
+def test_few_noisy_measurements_may_spoil_interpolated_velocities(series: str, *, detected: bool) -> None:
+    """One in forty is off by four times the turn rate; the others are right."""
+
+    def spoil(rate: NDArray[np.float64]) -> NDArray[np.float64]:
+        rate[::40, 0] += 0.8
+        return rate
+
+    assert bool(_check_twists(series, angular_velocity_radps=spoil)) is detected
 
 
 @pytest.mark.parametrize(

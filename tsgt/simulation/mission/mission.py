@@ -505,6 +505,8 @@ class Mission:
         if computer.is_down or computer.is_suspended:
             return
         line.faults.drop_responses = True
+        # What was read before and not written yet is written after it, unless a kill prevents it.
+        self._record_crash_window(computer)
         resume = computer.suspend()
         await asyncio.sleep(for_s)
         line.faults.drop_responses = False

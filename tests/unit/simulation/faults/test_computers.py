@@ -72,14 +72,21 @@ def test_suspended_computer_is_neither_rebooted_nor_killed(tmp_path: Path) -> No
     assert len(result.station_logs[2].journals) == 2  # the client restarts when it is resumed
 
 
+@pytest.mark.parametrize("disk_full", [False, True])
 @pytest.mark.slow
-def test_write_that_is_torn_as_a_computer_resumes(tmp_path: Path) -> None:
-    """The client that began anew after the suspension died of it, and is restarted; time goes on meanwhile."""
+def test_write_that_is_torn_as_a_computer_resumes(tmp_path: Path, *, disk_full: bool) -> None:
+    """The client that began anew after the suspension died of it, and is restarted; time goes on meanwhile.
+
+    If the disk was full before the suspension, what was measured then is lost.
+    """
 
     async def suspend(mission: Mission) -> None:
-        await mission.sleep_until(4.0)
         torn = Fault(4.0, FaultKind.TORN_WRITE, 2, 1.0, 1)
         async with asyncio.TaskGroup() as group:
+            await mission.sleep_until(2.0)
+            if disk_full:
+                group.create_task(inject_fault(mission, Fault(2.0, FaultKind.DISK_FULL, 2, 4.0, 1)))
+            await mission.sleep_until(4.0)
             group.create_task(mission.suspend(2, 14.0))
             group.create_task(inject_fault(mission, torn))
 

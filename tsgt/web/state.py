@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tsgt.model import PolarMeasurement
@@ -39,7 +40,9 @@ _DELAYED = b'"delay_s":'
 _VALID = b'"valid":true'
 
 POSE_INTERVAL_S = 0.08
-"""Poses that come sooner after the last decoded one are only counted, unless their validity has changed."""
+"""Poses that come sooner after the last decoded one are only counted, unless their validity has changed; the newest of them is
+decoded when the state is looked at.
+"""
 
 SMOOTHED_AGE_LIMIT_S = 3.0
 
@@ -93,6 +96,7 @@ class MissionState:
         self._live: _Pose | None = None
         self._live_s = -math.inf
         self._live_valid: bool | None = None
+        self._not_decoded: bytes | None = None  # the newest live pose
         self._smoothed: _Pose | None = None
         self._share = Share()
         self._sights: dict[int, stations.Sight] = {}
@@ -156,9 +160,16 @@ class MissionState:
         valid = _VALID in data
         self._share.count(now_s, valid=valid)
         self._live_s = now_s
+        self._not_decoded = data
         if valid == self._live_valid and self._live is not None and now_s - self._live.at_s < POSE_INTERVAL_S:
             return
         self._live_valid = valid
+        self._decode_newest(now_s)
+
+    def _decode_newest(self, now_s: float) -> None:
+        data, self._not_decoded = self._not_decoded, None
+        if data is None:
+            return
         record = decode(PoseRecord, data)
         self._live = _Pose(record, now_s)
         self._stamp_ns = max(self._stamp_ns, record.stamp_ns)
@@ -225,6 +236,8 @@ class MissionState:
 
     def view(self, now_s: float) -> dict[str, Any]:
         """Return everything that the page shows except the histories."""
+        with suppress(ValueError):  # It is no pose: the one before stays
+            self._decode_newest(self._live_s)
         found = self._findings(now_s)
         shown = self._hold.update(found[0], now_s)
         others = [each for each in found if each.level is not Level.GOOD and each.cause not in shown.cause]

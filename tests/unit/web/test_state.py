@@ -284,14 +284,23 @@ def test_histories_are_sent_once() -> None:
 
 
 def test_poses_are_decoded_no_more_often_than_shown() -> None:
-    """At 100 Hz most are only counted; one that becomes invalid is seen at once."""
+    """At 100 Hz most are only counted; the newest is shown, and one that becomes invalid is seen at once."""
     state = running()
+    before = state.cursors().trail
     lines = [encode_line(pose(10 + i / 100, position_m=(10.0 + i, 10.0, 0.0))) for i in range(1, 6)]
     for i, line in enumerate(lines):
         state.line(line, 10.0 + (i + 1) / 100)
-    assert state.view(10.06)["pose"]["at"][0] == 10.0
+    assert state.view(10.06)["pose"]["at"][0] == 15.0
+    assert state.cursors().trail == before + 1
     feed(state, pose(10.06, valid=False, reason="tilt", quality="invalid"), now_s=10.06)
     assert verdict(state, 10.07)[0] == "NO POSE"
+
+
+def test_line_that_is_no_pose_leaves_the_pose_before() -> None:
+    """It is decoded only when the page is made, which goes on."""
+    state = running()
+    state.line(b'{"type":"pose","valid":true}\n', 10.01)
+    assert state.view(10.02)["pose"]["at"][0] == 10.0
 
 
 def test_other_protocol_is_refused() -> None:

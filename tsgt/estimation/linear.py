@@ -22,14 +22,16 @@ from tsgt.estimation.setup_uncertainty import PointUncertainty
 from tsgt.estimation.tracks import Track, build_tracks, has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import (
     check_layout,
+    covariance_scale,
     interpolate_prisms,
     interpolated_covariance,
-    interpolation_error_covariance,
     interpolation_error_s2,
+    interpolation_errors,
     pose_covariance,
     pose_displacement,
     poses_from_prisms,
     quaternion_from_rotation,
+    squared_misfit,
     twists,
 )
 
@@ -227,9 +229,7 @@ class LinearEstimator:
         velocity, angular_velocity = twists(self._layout, rotation, velocities[fitted])
         batch.position_m[rows] = poses.translation_m[fitted]
         batch.orientation_xyzw[rows] = quaternion_from_rotation(rotation)
-        batch.covariance[rows] = pose_covariance(
-            self._layout, rotation, covariances[fitted]
-        ) + interpolation_error_covariance(
+        common_errors = interpolation_errors(
             self._layout,
             rotation,
             error_s2[fitted],
@@ -237,15 +237,24 @@ class LinearEstimator:
             angular_acceleration_sigma_radps2=self._limits.angular_acceleration_sigma_radps2,
         )
         if self._uncertainty is not None:
-            displacement = pose_displacement(
-                self._layout,
-                rotation,
-                self._uncertainty.displacements(
-                    points[fitted], velocities[fitted], batch.station[rows], rotation
-                ),
+            setup_errors = self._uncertainty.displacements(
+                points[fitted], velocities[fitted], batch.station[rows], rotation
             )
+            displacement = pose_displacement(self._layout, rotation, setup_errors)
             batch.covariance_common[rows] = displacement @ displacement.swapaxes(1, 2)
-            batch.covariance[rows] += batch.covariance_common[rows]
+            common_errors = np.concatenate([common_errors, setup_errors], axis=3)
+        displacement = pose_displacement(self._layout, rotation, common_errors)
+        covariance = pose_covariance(self._layout, rotation, covariances[fitted])
+        covariance += displacement @ np.ascontiguousarray(displacement.swapaxes(1, 2))
+        misfit, freedom = squared_misfit(
+            self._layout,
+            rotation,
+            poses.translation_m[fitted],
+            points[fitted],
+            covariances[fitted],
+            common_errors,
+        )
+        batch.covariance[rows] = covariance_scale(misfit, freedom)[:, None, None] * covariance
         batch.velocity_mps[rows] = velocity
         batch.angular_velocity_radps[rows] = angular_velocity
         batch.residual_m[rows] = residual

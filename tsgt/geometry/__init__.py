@@ -7,6 +7,7 @@ bits for an item alone as in a batch: live stream, replay and post-processing ag
 
 from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
 from tsgt.geometry.euler import euler_angles_rad, euler_covariance, euler_jacobian
+from tsgt.geometry.fit_consistency import covariance_scale, squared_misfit
 from tsgt.geometry.interpolation import (
     NO_GAP_NS,
     Interpolated,
@@ -29,7 +30,7 @@ from tsgt.geometry.pose import (
     Poses,
     check_layout,
     covariance_over_lever_arm,
-    interpolation_error_covariance,
+    interpolation_errors,
     pose_covariance,
     pose_displacement,
     poses_from_prisms,
@@ -66,6 +67,7 @@ __all__ = [
     "corrected_angles",
     "corrected_distance",
     "covariance_over_lever_arm",
+    "covariance_scale",
     "euler_angles_rad",
     "euler_covariance",
     "euler_jacobian",
@@ -73,8 +75,8 @@ __all__ = [
     "interpolate",
     "interpolate_prisms",
     "interpolated_covariance",
-    "interpolation_error_covariance",
     "interpolation_error_s2",
+    "interpolation_errors",
     "invert",
     "log_so3",
     "measurement_covariance",
@@ -88,6 +90,7 @@ __all__ = [
     "rotate",
     "rotation_from_quaternion",
     "skew",
+    "squared_misfit",
     "transform_from",
     "transform_points",
     "twists",

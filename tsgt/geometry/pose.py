@@ -66,7 +66,7 @@ def pose_covariance(layout: FloatArray, rotation: FloatArray, prism_covariances:
     in the world in m^2, to (N, 6, 6), symmetric: x, y, z of the origin in m, rotation about the world's axes in rad.
     """
     from_robot = rotation[:, None, None]
-    gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
+    gain = _gain(layout).reshape(-1, 2, 3, 3)
     # The gain is constant in the robot frame: displacements are rotated into it, translation and rotation back.
     in_world = (from_robot @ gain @ from_robot.swapaxes(-2, -1)).reshape(*prism_covariances.shape[:2], 6, 3)
     covariance = _over_prisms(in_world @ prism_covariances @ in_world.swapaxes(2, 3))
@@ -79,13 +79,13 @@ def pose_displacement(layout: FloatArray, rotation: FloatArray, displacements: F
     With the arguments and the axes of :func:`pose_covariance`.
     """
     from_robot = rotation[:, None, None]
-    gain = _gains(layout)[0].reshape(-1, 2, 3, 3)
+    gain = _gain(layout).reshape(-1, 2, 3, 3)
     in_world = (from_robot @ gain @ from_robot.swapaxes(-2, -1)).reshape(*displacements.shape[:2], 6, 3)
     moved: FloatArray = (in_world @ displacements).sum(axis=1)
     return moved
 
 
-def interpolation_error_covariance(
+def interpolation_errors(
     layout: FloatArray,
     rotation: FloatArray,
     error_s2: FloatArray,
@@ -93,28 +93,23 @@ def interpolation_error_covariance(
     acceleration_sigma_mps2: float,
     angular_acceleration_sigma_radps2: float,
 ) -> FloatArray:
-    """Propagate the error of linear interpolation under an unknown acceleration through the fit.
+    """Displacements of prisms by linear interpolation under an unknown acceleration: (N, P, 3, 6) in the world, in m.
 
     The robot accelerates as a whole: its prisms' errors have one cause and are correlated. What they have in common shifts
     the pose; what differs between them, in time or in place on a rotating robot, rotates it.
 
     Parameters
     ----------
+    layout, rotation : as for :func:`pose_covariance`.
     error_s2 : (N, P) interpolation error per unit of acceleration: see :func:`tsgt.geometry.interpolation_error_s2`.
     acceleration_sigma_mps2 : One sigma, per axis, of the acceleration of the prisms' centroid.
     angular_acceleration_sigma_radps2 : One sigma, per axis, of the robot's angular acceleration.
-
-    Returns (N, 6, 6), to be added to :func:`pose_covariance`, with the same arguments and axes.
     """
-    effects = _over_prisms(error_s2[:, :, None, None, None] * _gains(layout)[1])
-    # From the robot frame, where the gains are constant, to the world; translation and rotation separately.
-    blocks = effects.reshape(-1, 2, 2, 3, 3)
-    in_world = (rotation[:, None, None] @ blocks).reshape(effects.shape)
-    covariances = in_world @ np.ascontiguousarray(in_world.swapaxes(2, 3))
-    covariance = np.zeros((len(rotation), 6, 6))
-    covariance += acceleration_sigma_mps2**2 * covariances[:, 0]
-    covariance += angular_acceleration_sigma_radps2**2 * covariances[:, 1]
-    return covariance
+    arms = skew(layout - layout.mean(axis=0))
+    errors = np.empty((*error_s2.shape, 3, 6))
+    errors[..., :3] = acceleration_sigma_mps2 * np.eye(3)
+    errors[..., 3:] = -angular_acceleration_sigma_radps2 * (rotation[:, None] @ arms)
+    return np.asarray(error_s2[..., None, None] * errors)
 
 
 def twists(
@@ -126,7 +121,7 @@ def twists(
     the angular velocity in the robot frame in rad/s, (N, 3) each.
     """
     in_robot = rotate(np.swapaxes(rotation, 1, 2)[:, None], prism_velocities_mps)
-    twist = _over_prisms(rotate(_gains(layout)[0], in_robot))
+    twist = _over_prisms(rotate(_gain(layout), in_robot))
     return rotate(rotation, twist[:, :3]), twist[:, 3:]
 
 
@@ -181,17 +176,15 @@ def _over_prisms(terms: FloatArray) -> FloatArray:
     return sum((terms[:, i] for i in range(terms.shape[1])), start=np.zeros_like(terms[:, 0]))
 
 
-def _gains(layout: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gains of a layout: of the fit, (P, 6, 3), and of linear and angular acceleration, (P, 2, 6, 3), in the robot frame."""
-    return _cached_gains(np.asarray(layout, dtype=np.float64).tobytes())
+def _gain(layout: FloatArray) -> FloatArray:
+    """Gain of the fit of a layout: (P, 6, 3) in the robot frame."""
+    return _cached_gain(np.asarray(layout, dtype=np.float64).tobytes())
 
 
 @lru_cache(maxsize=16)
-def _cached_gains(layout: bytes) -> tuple[FloatArray, FloatArray]:
-    """Compute the gains once per layout: they cost more than the rest of a single pose."""
+def _cached_gain(layout: bytes) -> FloatArray:
+    """Compute the gain once per layout: it costs more than the rest of a single pose."""
     prisms = np.frombuffer(layout).reshape(-1, 3)
     gain = fit_gain(prisms, np.ones(len(prisms)))
-    angular = gain @ skew(prisms - prisms.mean(axis=0))
-    both = np.stack([gain, angular], axis=1)
-    gain.flags.writeable = both.flags.writeable = False
-    return gain, both
+    gain.flags.writeable = False
+    return gain

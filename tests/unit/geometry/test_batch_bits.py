@@ -12,13 +12,15 @@ from scipy.spatial.transform import Rotation
 from tsgt.geometry import (
     interpolate,
     interpolated_covariance,
-    interpolation_error_covariance,
     interpolation_error_s2,
+    interpolation_errors,
     measurement_covariance,
     polar_to_cartesian,
     pose_covariance,
+    pose_displacement,
     poses_from_prisms,
     quaternion_from_rotation,
+    squared_misfit,
     transform_from,
     transform_points,
     twists,
@@ -55,6 +57,13 @@ def pose_quantities(count: int) -> Callable[[Items], Results]:
 
     def compute(items: Items) -> Results:
         poses = poses_from_prisms(layout, PRISMS[items, :count])
+        common_errors = interpolation_errors(
+            layout,
+            poses.rotation,
+            np.abs(VELOCITIES[items, :count, 0]),
+            acceleration_sigma_mps2=0.3,
+            angular_acceleration_sigma_radps2=0.2,
+        )
         return (
             poses.rotation,
             poses.translation_m,
@@ -63,13 +72,16 @@ def pose_quantities(count: int) -> Callable[[Items], Results]:
             quaternion_from_rotation(poses.rotation),
             pose_covariance(layout, poses.rotation, COVARIANCES[items, :count]),
             *twists(layout, poses.rotation, VELOCITIES[items, :count]),
-            interpolation_error_covariance(
+            common_errors,
+            pose_displacement(layout, poses.rotation, common_errors),
+            squared_misfit(
                 layout,
                 poses.rotation,
-                np.abs(VELOCITIES[items, :count, 0]),
-                acceleration_sigma_mps2=0.3,
-                angular_acceleration_sigma_radps2=0.2,
-            ),
+                poses.translation_m,
+                PRISMS[items, :count],
+                COVARIANCES[items, :count],
+                common_errors,
+            )[0],
         )
 
     return compute

@@ -1,6 +1,6 @@
 """Planted defects: functions of the program replaced by defective ones for a test or benchmark.
 
-`benchmarks/planted_defects.py` shows which invariants and tests detect them.
+`benchmarks/missions/planted_defects.py` shows which invariants and tests detect them.
 """
 
 from __future__ import annotations

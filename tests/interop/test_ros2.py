@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
-LATENCY_S = 0.1  # generous: other tests may use the machine; benchmarks/ros2.py measures it
+LATENCY_S = 0.1  # generous: other tests may use the machine; benchmarks/readers/ros2.py measures it
 
 pytestmark = [
     pytest.mark.slow,

@@ -60,7 +60,7 @@ UNAIDED_S = 10.0
 
 UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 """Of the position in m and the rotation in rad by what an unconfirmed set-up may have wrong: a mounting 1 deg off moves poses by
-0.35 deg rms, a lever arm 100 mm off or a latency 10 ms off by 2 mm and 0.2 deg (benchmarks/imu_trust.py).
+0.35 deg rms, a lever arm 100 mm off or a latency 10 ms off by 2 mm and 0.2 deg (benchmarks/run.py imu_trust).
 """
 
 _POSE_DIM = 6

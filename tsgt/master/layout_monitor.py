@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 QUARTILE = 4
 """The alarm uses the lower quartile of residual over limit. Interpolation brings the median of a good frame to 1.1 at
-1.45 Hz per station, and the lower quartile no higher than 0.7 (``benchmarks/frame_watch.py``)."""
+1.45 Hz per station, and the lower quartile no higher than 0.7 (``benchmarks/run.py frame_watch``)."""
 
 RESTORED_RATIO = 0.8  # share of the limit below which the alarm ends; hysteresis
 

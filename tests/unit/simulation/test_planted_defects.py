@@ -1,10 +1,9 @@
-"""The defects of `benchmarks/planted_defects.py` can be planted, detected and removed."""
+"""The defects of `benchmarks/missions/planted_defects.py` can be planted, detected and removed."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
-import sys
+import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,21 +11,18 @@ import pytest
 from harness.defects import Planting
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from types import ModuleType
 
-SCRIPT = Path(__file__).parents[3] / "benchmarks" / "planted_defects.py"
+BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
-def script() -> ModuleType:
+def script() -> Iterator[ModuleType]:
     """Return the benchmark."""
-    spec = importlib.util.spec_from_file_location("planted_defects", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for it
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        yield importlib.import_module("missions.planted_defects")
 
 
 @pytest.mark.parametrize(("key", "check"), [("angle", "journal"), ("offset", "time"), ("order", "replay")])

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from imu import NEES_LIMIT, Mission, missing, mission_parser, simulated
 
+from inertial.imu import NEES_LIMIT, Mission, missing, mission_parser, simulated
 from tsgt.geometry import log_so3
 from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.log import configure_logging

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from imu_calibration import recorded_mission
 from scipy.spatial.transform import Rotation
 
+from inertial.imu_calibration import recorded_mission
 from tsgt.estimation import ImuSetupMonitor
 from tsgt.log import configure_logging
 from tsgt.model import ImuSamples

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from imu import Mission, simulated
 
+from inertial.imu import Mission, simulated
 from tsgt.geometry import exp_so3, log_so3
 from tsgt.geometry.inertial import InertialFixedLagSmoother
 from tsgt.log import configure_logging

@@ -2,7 +2,7 @@
 
     python benchmarks/run.py peers [--duration 120] [--seeds 1] [--scenarios dynamic quarry ...]
 
-It needs gtsam: `pip install --requirement benchmarks/peers.txt`, in an environment of its own that also has tsgt. Each row is one
+It needs gtsam: `pip install --requirement benchmarks/poses/peers.txt`, in an environment of its own that also has tsgt. Each row is one
 estimator on one scenario: RMS error of the position at the robot's origin and of the rotation, at 5 Hz from the first to the last
 measurement, once everywhere and once while each prism's measurements before and after are at most 1 s apart; the share of the
 epochs that has a pose; mean NEES of the six components, 6 if the stated covariance is right; CPU time by minute of data. The
@@ -432,7 +432,7 @@ def main() -> None:
         peers = {name: each for name, each in PEERS.items() if not name.startswith("gtsam")}
     elif importlib.util.find_spec("gtsam") is None:
         sys.exit(
-            "gtsam is not installed: pip install --requirement benchmarks/peers.txt, or give --without-gtsam"
+            "gtsam is not installed: pip install --requirement benchmarks/poses/peers.txt, or give --without-gtsam"
         )
     for scenario in arguments.scenarios:
         problems = [drawn(scenario, arguments.duration, seed) for seed in range(1, arguments.seeds + 1)]

@@ -5,7 +5,7 @@
     python benchmarks/run.py noise held-out RECORDING...
 
 ``simulated``: the robot of the scenario `dynamic`, measured three times 2.5 Hz with white noise as stated, with the time errors
-of the client's fit of the instrument's clock (benchmarks/instrument_time.py) and the time noise that the estimator assumes.
+of the client's fit of the instrument's clock (benchmarks/instruments/instrument_time.py) and the time noise that the estimator assumes.
 The truth is the root mean square of the noise that was drawn over what is stated. ``prior``: robots that move as the motion prior
 says, without a stop, for 42 s each; the prior tuned, and given. ``held-out``: by component, moving and
 at rest; near a loss of lock apart.
@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from harness.prior_motion import draw_motions, measure, sorted_by_time
-from instrument_time import Case, errors
+from instruments.instrument_time import Case, errors
 from measuring import normalised_squared
 
 from tsgt.analysis.diagnosis.noise_factors import near_gaps

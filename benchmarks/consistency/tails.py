@@ -1,7 +1,7 @@
 """Tails of the NEES of a robot that starts, stops and turns.
 
 Batch poses of the robot of the scenario `dynamic`, whose motion is not Gaussian, measured three times 2.5 Hz, with the time
-errors of the client's fit of the instrument's clock (benchmarks/instrument_time.py); clients and instruments restart every
+errors of the client's fit of the instrument's clock (benchmarks/instruments/instrument_time.py); clients and instruments restart every
 ten minutes. Once with the stated time noise alone, once with that of the estimator.
 
     python benchmarks/run.py tails [HOURS] [FIRST_SEED]
@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-from instrument_time import Case, errors
+from instruments.instrument_time import Case, errors
 from measuring import normalised_squared
 from scipy.stats import chi2
 

@@ -24,16 +24,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from endurance_subscribers import Subscribers
-from endurance_watch import (
+from harness.kill_checks import check_files_after_kills
+
+from missions.endurance_subscribers import Subscribers
+from missions.endurance_watch import (
     Sample,
     Stream,
     beacons_ns,
     lossy_scenario,
     memory_slope,
 )
-from harness.kill_checks import check_files_after_kills
-
 from tsgt.clock import SystemClock
 from tsgt.log import configure_logging
 from tsgt.simulation.checks import Violation

@@ -1,6 +1,6 @@
 """Defects planted by somebody who had read the user documentation only: thirty, each of which a user would act on.
 
-python benchmarks/run.py planted_defects --from benchmarks/planted_by_strangers.py
+python benchmarks/run.py planted_defects --from benchmarks/missions/planted_by_strangers.py
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import errno
 from typing import TYPE_CHECKING
 
 from harness import defects_of_strangers as d
-from planted_defects import Defect, silent_station
 
+from missions.planted_defects import Defect, silent_station
 from tsgt.simulation.faults import FaultKind as F
 from tsgt.simulation.mission import MASTER, station_name
 

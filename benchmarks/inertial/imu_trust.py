@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from imu import mission_stem, simulated
-from imu_setup import CONFIGURED, SAMPLED, multiplied
 
+from inertial.imu import mission_stem, simulated
+from inertial.imu_setup import CONFIGURED, SAMPLED, multiplied
 from tsgt.estimation import LiveEstimator, centroid_at_point
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.log import configure_logging

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
-from continuous_figure import COLOURS, FROM_S, UNTIL_S, errors
 
+from poses.continuous_figure import COLOURS, FROM_S, UNTIL_S, errors
 from tsgt.analysis.evaluation import read_tum
 from tsgt.recording import load_recording
 

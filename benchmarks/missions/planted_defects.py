@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from tsgt.config import ImuModelName
     from tsgt.simulation.mission import Mission
 
-TESTS = Path(__file__).parents[1] / "tests"
+BENCHMARKS = Path(__file__).parents[1]
+TESTS = BENCHMARKS.parent / "tests"
 
 STRANGERS = Path(__file__).with_name("planted_by_strangers.py")
 
@@ -353,11 +354,11 @@ def all_defects() -> dict[str, Defect]:
 
 def fails(key: str, test: str) -> bool:
     """Whether a defect's test passes without it and fails with it, each time in a process of its own."""
-    planted = f"import planted_defects as p; p.all_defects()[{key!r}].plant(p.Planting())"
+    planted = f"from missions import planted_defects as p; p.all_defects()[{key!r}].plant(p.Planting())"
     run = (
         f"import sys, pytest; sys.exit(pytest.main(['-q', '-p', 'no:cacheprovider', {str(TESTS / test)!r}]))"
     )
-    path = os.pathsep.join([str(Path(__file__).parent), str(TESTS), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(BENCHMARKS), str(TESTS), os.environ.get("PYTHONPATH", "")])
     ends = [
         subprocess.run(
             [sys.executable, "-c", f"{first}\n{run}"],

@@ -1,0 +1,1 @@
+"""Who reads the stream: relay, operator's page, ROS 2."""

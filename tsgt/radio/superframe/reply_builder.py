@@ -19,10 +19,10 @@ from tsgt.radio.superframe.wire import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from tsgt.radio.superframe.command_exchange import InstrumentState
-    from tsgt.radio.superframe.send_queue import SendQueue, StampedMeasurement
+    from tsgt.radio.superframe.send_queue import QueuedMeasurement, SendQueue, StampedMeasurement
     from tsgt.radio.superframe.session import ReplySlot, StationSession
     from tsgt.radio.superframe.wire import StatusReport
 
@@ -40,8 +40,10 @@ room."""
 
 MAX_SHORT_QUEUE = 8  # a longer queue is a backlog, delivered newest first
 
-MAX_SKIPPED_REPLIES = 2
-"""After this many replies without the oldest of a short queue it takes precedence for one reply."""
+MAX_SKIPPED_REPLIES, MAX_SKIPPED_REPLIES_OF_BACKLOG = 2, 8
+"""After this many replies without the oldest of the queue it takes precedence for one reply: what the master has beyond it is
+acknowledged with it, while grants that fit new measurements only would never come to it.
+"""
 
 
 class ReplyBuilder:
@@ -70,8 +72,8 @@ class ReplyBuilder:
             if fits and (len(still) == len(packed) or session.commands.turnaround_overdue):
                 reply, packed = longer, still
         sequences = tuple(stamped.queued.sequence for stamped in packed)
-        oldest = min((stamped.queued.sequence for stamped in urgent), default=None)
-        self._skipped_replies = 0 if oldest is None or oldest in sequences else self._skipped_replies + 1
+        left_out = urgent and min(stamped.queued.sequence for stamped in urgent) not in sequences
+        self._skipped_replies = self._skipped_replies + 1 if left_out else 0
         return reply, sequences
 
     def _control_parts(
@@ -107,17 +109,26 @@ class ReplyBuilder:
     def _by_urgency(
         self, session: StationSession, slot_ns: int, max_measurements: int
     ) -> list[StampedMeasurement]:
-        """Return the timed measurements: the newest, then the oldest of a short queue or the next newer of a backlog."""
-        deliverable = filter(session.can_timestamp, self._queue.newest_first())
+        """Return the timed measurements: the newest, then the oldest of a short queue or the next newer of a backlog; and the oldest.
+
+        The oldest comes first if the last replies have left it out.
+        """
         urgent: list[StampedMeasurement] = []
-        for queued in islice(deliverable, max_measurements):
-            stamped = session.timestamped(queued, slot_ns, urgent[0] if urgent else None)
-            if stamped is not None:
-                urgent.append(stamped)
-        if 1 < len(self._queue) <= MAX_SHORT_QUEUE:
+
+        def add(candidates: Iterable[QueuedMeasurement], count: int) -> None:
+            for queued in islice(filter(session.can_timestamp, candidates), count):
+                stamped = session.timestamped(queued, slot_ns, urgent[0] if urgent else None)
+                if stamped is not None and (not urgent or queued.sequence < urgent[-1].queued.sequence):
+                    urgent.append(stamped)
+
+        add(self._queue.newest_first(), max_measurements)
+        add(self._queue.oldest_first(), 1)
+        short = len(self._queue) <= MAX_SHORT_QUEUE
+        limit = MAX_SKIPPED_REPLIES if short else MAX_SKIPPED_REPLIES_OF_BACKLOG
+        if short:
             urgent[1:] = urgent[:0:-1]
-            if self._skipped_replies >= MAX_SKIPPED_REPLIES:
-                urgent[:2] = urgent[1::-1]
+        if len(urgent) > 1 and self._skipped_replies >= limit:
+            urgent.insert(0, urgent.pop(1 if short else -1))
         return urgent
 
 

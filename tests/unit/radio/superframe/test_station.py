@@ -628,6 +628,19 @@ def test_old_measurements_of_short_queue_are_delivered() -> None:
     assert 0 in master.received
 
 
+def test_oldest_of_backlog_is_delivered_when_grants_fit_new_measurements_only() -> None:
+    """A master that lacks a single old measurement grants no more, and its cumulative acknowledgement waits for it."""
+    master, station, send_queue = joined()
+    for number in range(12):
+        send_queue.add(queued(number, master.now_ns - 60 * SECOND, prism=5))
+    master.grant = GRANT_BYTES.index(26)
+    for number in range(12, 48, 2):
+        for each in (number, number + 1):
+            send_queue.add(queued(each, master.now_ns + master.frame_ns))
+        master.frame(station)
+    assert 0 in master.received
+
+
 def test_turnaround_of_previous_frame_is_reported() -> None:
     """From RxDone of the beacon to TxDone of the reply, at the master's clock rate."""
     master, station, _ = joined()

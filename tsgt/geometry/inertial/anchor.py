@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.rigid import FloatArray, inverse_right_jacobian, matvec, skew
+from tsgt.geometry.rigid import FloatArray, cross, inverse_right_jacobian, matvec, skew
 
 if TYPE_CHECKING:
     from tsgt.geometry.inertial.states import InertialStates
@@ -74,14 +74,14 @@ class InertialAnchor:
 
 def _velocity(states: InertialStates, point: FloatArray, rate: FloatArray) -> FloatArray:
     """(K, 3) velocity of a point in addition to that of the IMU's origin."""
-    return matvec(states.rotation, np.cross(rate - states.gyro_bias, point))
+    return matvec(states.rotation, cross(rate - states.gyro_bias, point))
 
 
 def _by_state(first: InertialStates, point: FloatArray, rate: FloatArray, size: int) -> FloatArray:
     """(D + S, D + S) Jacobian of the error about a point by that about the IMU's origin, for small rotations from one to the other."""
     rotation = first.rotation[0]
     found = np.eye(size)
-    found[_POSITION, _ROTATION] = -rotation @ skew(point)
-    found[_VELOCITY, _ROTATION] = -rotation @ skew(np.cross(rate - first.gyro_bias[0], point))
-    found[_VELOCITY, _GYRO_BIAS] = rotation @ skew(point)
+    found[_VELOCITY, _GYRO_BIAS] = by_turning = rotation @ skew(point)
+    found[_POSITION, _ROTATION] = -by_turning
+    found[_VELOCITY, _ROTATION] = -rotation @ skew(cross(rate - first.gyro_bias[0], point))
     return found

@@ -277,10 +277,7 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     found = factors.preintegrated
     gyro_only = not factors.with_accelerometer
     earlier, later = knots.select(slice(None, -1)), knots.select(slice(1, None))
-    force = error = np.zeros((len(found), 3))
-    if gravity.matrix.size:
-        force = found.mean_force()
-        error = gravity.force_error(force)
+    error = gravity.force_error(found.force)
     position, rotation, velocity = _motion(earlier, found, error, gyro_only=gyro_only)
     R_T = earlier.rotation.swapaxes(1, 2)
     turned = R_T @ later.rotation
@@ -300,7 +297,6 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     moved, gained = _moved_and_gained(earlier, later, duration_s, gravity.vector())
     by_tilt = R_T @ gravity.by_tilt()
     rows = np.zeros((len(found), 9, column + 1))
-    rows[:, 3:6] = by_rotation
     rows[:, 0:3, 0:3], rows[:, 0:3, size : size + 3] = -R_T, R_T
     rows[:, 0:3, 3:6] = skew(moved)
     rows[:, 0:3, 6:9] = -duration_s[..., None] * R_T
@@ -310,11 +306,10 @@ def linearise_inertial(knots: InertialStates, gravity: Gravity, factors: Inertia
     rows[:, 6:9, 6:9], rows[:, 6:9, size + 6 : size + 9] = -R_T, R_T
     rows[:, 6:9, tilt_part] = -duration_s[..., None] * by_tilt
     rows[:, 6:9, column] = gained - velocity
-    for part in (slice(0, 3), slice(6, 9)):
-        rows[:, part, 9:12] = -found.by_gyro_bias[:, part]
-        rows[:, part, 12:15] = -found.by_accelerometer_bias[:, part]
-        if gravity.matrix.size:
-            rows[:, part, matrix_part] = -gravity.by_matrix(found.by_accelerometer_bias[:, part], force)
+    rows[:, :, 9:12] = -found.by_gyro_bias
+    rows[:, :, 12:15] = -found.by_accelerometer_bias
+    rows[:, :, matrix_part] = -gravity.by_matrix(found.by_accelerometer_bias, found.force)
+    rows[:, 3:6] = by_rotation
     whitened_rows: FloatArray = factors.whitening @ rows
     return whitened_rows
 
@@ -381,7 +376,7 @@ def inertial_costs(
     found = steps.preintegrated
     error = np.zeros((len(found), 3))
     if anchor.shared.size > TILT_DIM:
-        force = factors.preintegrated.mean_force()
+        force = factors.preintegrated.force
         error = np.concatenate([gravity.force_error(force) for gravity in gravities])
     position, rotation, velocity = _motion(earlier, found, error, gyro_only=not with_accelerometer)
     turned = fast_log_so3(rotation.swapaxes(1, 2) @ (earlier.rotation.swapaxes(1, 2) @ later.rotation))
@@ -445,20 +440,19 @@ def _add_walks(
     gradient: FloatArray,
 ) -> float:
     """Add the random walks of the biases, in place; return the sum of squared Mahalanobis distances."""
-    cost = 0.0
-    walks = [(slice(9, 12), knots.gyro_bias, factors.walk_information[:, 0])]
-    if factors.with_accelerometer:
-        walks.append((slice(12, 15), knots.bias_or_acceleration, factors.walk_information[:, 1]))
-    for components, bias, information in walks:
-        step = bias[1:] - bias[:-1]
-        weighted = information[:, None] * step
-        np.einsum("kii->ki", diagonal[:-1, components, components])[...] += information[:, None]
-        np.einsum("kii->ki", diagonal[1:, components, components])[...] += information[:, None]
-        np.einsum("kii->ki", off_diagonal[:, components, components])[...] -= information[:, None]
-        gradient[:-1, components] -= weighted
-        gradient[1:, components] += weighted
-        cost += float((weighted * step).sum())
-    return cost
+    number = 2 if factors.with_accelerometer else 1
+    components = slice(9, 9 + 3 * number)
+    bias = np.concatenate([knots.gyro_bias, knots.bias_or_acceleration], axis=1)[:, : 3 * number]
+    information = np.repeat(factors.walk_information[:, :number], 3, axis=1)
+    step = bias[1:] - bias[:-1]
+    weighted = information * step
+    of_knots, of_steps = (np.einsum("kii->ki", each)[:, components] for each in (diagonal, off_diagonal))
+    of_knots[:-1] += information
+    of_knots[1:] += information
+    of_steps -= information
+    gradient[:-1, components] -= weighted
+    gradient[1:, components] += weighted
+    return float((weighted * step).sum())
 
 
 def _as_states(

@@ -122,6 +122,8 @@ class Preintegrated:
     gyro_bias: FloatArray  # (K, 3) bias that was subtracted, rad/s
     accelerometer_bias: FloatArray  # (K, 3) m/s^2
     missing_s: FloatArray  # (K,) time without samples
+    # (K, 3) mean specific force, in the turning axes of the IMU, without the bias that was subtracted
+    force: FloatArray
 
     def __len__(self) -> int:
         return len(self.duration_s)
@@ -139,13 +141,8 @@ class Preintegrated:
             self.gyro_bias[rows],
             self.accelerometer_bias[rows],
             self.missing_s[rows],
+            self.force[rows],
         )
-
-    def mean_force(self) -> FloatArray:
-        """(K, 3) mean specific force, in the turning axes of the IMU, without the bias that was subtracted."""
-        # An interval may have no length.
-        integral = 1e-12 * IDENTITY - self.by_accelerometer_bias[:, 6:9]
-        return matvec(np.asarray(np.linalg.inv(integral), np.float64), self.velocity)
 
     def corrected(
         self, gyro_bias: FloatArray, accelerometer_bias: FloatArray
@@ -324,17 +321,22 @@ def _integrate(samples: ContiguousSamples, part: _Part, found: _Integrals) -> Pr
     by_gyro = (weights_T * gyro_variance[:, None]) @ weights
     by_force = (weights_T[:, :2] * force_variance[:, None]) @ weights[..., :2]
     within = (force_variance * dt_s**2).sum(axis=1) / 12
+    velocity = total[:, :3].copy()
+    # An interval may have no length.
+    whole = 1e-12 * IDENTITY - by_accelerometer_bias[:, 6:9]
+    mean_force = matvec(np.asarray(np.linalg.inv(whole), np.float64), velocity)
     return Preintegrated(
         part.end_s - part.start_s,
         total[:, 3:] - sculling[:, 0],
         end_rotation,
-        total[:, :3].copy(),
+        velocity,
         _covariance(by_gyro, by_force, within, end_rotation_T),
         by_gyro_bias,
         by_accelerometer_bias,
         part.biases[:, :3],
         part.biases[:, 3:],
         (dt_s * samples.missing[index]).sum(axis=1),
+        mean_force,
     )
 
 

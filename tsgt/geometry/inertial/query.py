@@ -54,7 +54,7 @@ def strapdown(start: InertialStates, gravity: Gravity, motion: Preintegrated) ->
     """Propagate N states by motions that begin at their times; biases are those of the states, to first order."""
     bias = force = start.bias_or_acceleration
     if gravity.matrix.size:
-        force = motion.mean_force()
+        force = motion.force
         bias = bias + gravity.force_error(force)
     delta_p, delta_R, delta_v = motion.corrected(start.gyro_bias, bias)
     R, duration_s = start.rotation, motion.duration_s[:, None]

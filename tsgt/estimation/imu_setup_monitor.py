@@ -20,7 +20,12 @@ from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.batch import fit_trajectory, scale_noise
 from tsgt.geometry.inertial import Gravity, Mounting, fit_inertial_trajectory, sound_samples
-from tsgt.geometry.inertial_calibration import SetupCheck, check_few_prisms, check_imu_setup
+from tsgt.geometry.inertial_calibration import (
+    MIN_CHECKED_MEASUREMENTS,
+    SetupCheck,
+    check_few_prisms,
+    check_imu_setup,
+)
 from tsgt.model import MIN_PRISMS
 from tsgt.recording import EventRecord
 
@@ -84,18 +89,23 @@ def check_recorded_setup(
         return SetupCheck()
     origin_ns = measurements[0].stamp_ns
     observations, _ = build_observations(parameters, measurements, origin_ns=origin_ns)
+    few_prisms = len(parameters.prisms) < MIN_PRISMS
+    # Of three prisms, a few measurements may show gross errors.
+    least = MIN_CHECKED_MEASUREMENTS if few_prisms else 1
+    if len(observations) < least:
+        return SetupCheck()
     samples = sound_samples(inertial_samples(records, imu, origin_ns), imu)
     if not len(samples):
         return SetupCheck()
     # A backlog arrives with measurements of times whose samples are held no more.
     observations = observations.select(observations.time_s >= samples.end_s[0] - UNSAMPLED_S)
-    if not len(observations):
+    if len(observations) < least:
         return SetupCheck()
     rotation = rotation_from_quaternion(np.array(imu.orientation_xyzw))
     mounting = Mounting(rotation, np.array(imu.position_m) - centroid_m(parameters))
     observations = scale_noise(observations, noise_scales(parameters))
     try:
-        if len(parameters.prisms) < MIN_PRISMS:
+        if few_prisms:
             with_imu = fit_inertial_trajectory(observations, samples, imu, reference_m=centroid_m(parameters))
             knots = with_imu.trajectory.knots
             states, _ = with_imu.trajectory.at(knots.time_s, dim=_POSE_DIM)

@@ -215,7 +215,7 @@ def test_backlog_is_not_compared_without_its_samples(prisms: int, monkeypatch: p
 
     monkeypatch.setattr(imu_setup_monitor, "fit_trajectory", fit)
     monkeypatch.setattr(imu_setup_monitor, "fit_inertial_trajectory", fit)
-    found = uncalibrated_drive(8.0)
+    found = uncalibrated_drive(20.0)
     parameters = parameters_of(found, calibrated_imu(found))
     parameters = replace(parameters, prisms=parameters.prisms[:prisms])
     points = point_measurements(found)
@@ -223,7 +223,22 @@ def test_backlog_is_not_compared_without_its_samples(prisms: int, monkeypatch: p
     assert check_recorded_setup(parameters, points, samples) == SetupCheck()
     (time_s,) = compared
     assert 3.0 <= time_s[0] < 3.6
-    assert time_s[-1] > 7.0
+    assert time_s[-1] > 19.0
+
+
+@pytest.mark.parametrize("prisms", [2, 1])
+def test_few_measurements_of_few_prisms_are_not_fitted(prisms: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They do not tell the set-up, and a fit takes a third of a second."""
+
+    def fit(*_: object, **__: object) -> None:
+        pytest.fail("fitted")
+
+    monkeypatch.setattr(imu_setup_monitor, "fit_inertial_trajectory", fit)
+    found = uncalibrated_drive(8.0)
+    parameters = parameters_of(found, calibrated_imu(found))
+    parameters = replace(parameters, prisms=parameters.prisms[:prisms])
+    points = [each for each in point_measurements(found) if each.station <= prisms][:59]
+    assert check_recorded_setup(parameters, points, imu_records(found)) == SetupCheck()
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from tsgt.geometry.inertial_calibration.observability import (
 )
 from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_calibrated_axes
 from tsgt.geometry.inertial_calibration.setup_check import (
+    MIN_CHECKED_MEASUREMENTS,
     Cause,
     SetupCheck,
     SetupFinding,
@@ -21,6 +22,7 @@ from tsgt.geometry.inertial_calibration.setup_check import (
 )
 
 __all__ = [
+    "MIN_CHECKED_MEASUREMENTS",
     "Alignment",
     "Cause",
     "ImuCalibration",

@@ -81,7 +81,7 @@ FAST_MARGIN_S = 1.0  # Before and after them: the trajectory of the stations is 
 MAX_FAST_SHARE = 0.2  # Of a drive; above it the unit is wrong, or the robot turns like this
 
 MIN_SHARED_S = 7.0  # In which both are known: a share of the shortest drive that is checked
-MIN_MEASUREMENTS = 60
+MIN_CHECKED_MEASUREMENTS = 60  # Fewer do not tell the set-up
 MIN_EXTENT_M = 0.05  # Between prisms that tell a rotation
 MATRIX_SIGMA = 1e-2  # Of the matrices beside what is configured
 MIN_RATE_FACTOR, MIN_FORCE_FACTOR = 2.0, 1.25
@@ -276,7 +276,7 @@ def _estimated_errors(
     )
     stamps_s = stamp_times(observations, near)
     measured = observations.select((stamps_s > filled.bounds_s[0]) & (stamps_s < filled.bounds_s[-1]))
-    if len(measured) < MIN_MEASUREMENTS:
+    if len(measured) < MIN_CHECKED_MEASUREMENTS:
         return SetupCheck()
     try:
         solution = solve_jointly(

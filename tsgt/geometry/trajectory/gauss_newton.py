@@ -16,7 +16,7 @@ import numpy as np
 
 from tsgt.geometry.rigid import dot, fast_log_so3, inverse_right_jacobian
 from tsgt.geometry.trajectory.block_tridiagonal import BlockCholesky, factorise
-from tsgt.geometry.trajectory.measurement_factors import linearise
+from tsgt.geometry.trajectory.measurement_factors import linearise, squared_distances_at
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas
 from tsgt.geometry.trajectory.states import (
     STATE_DIM,
@@ -24,6 +24,7 @@ from tsgt.geometry.trajectory.states import (
     States,
     add_process_factors,
     linearise_process,
+    process_cost,
 )
 
 if TYPE_CHECKING:
@@ -207,19 +208,33 @@ def _minimise(
     def evaluate(knots: States) -> NormalEquations:
         return assemble(observations, knot_index, knots, process, anchor, rejectable=rejectable)
 
+    def cost_at(knots: States) -> float:
+        squares = squared_distances_at(observations, knots, knot_index)
+        measured = float(robust_loss(squares, rejectable=rejectable)[1].sum())
+        return measured + process_cost(knots, process) + _anchor_cost(knots, anchor)
+
     iterations = 0
     factor, system = evaluate(knots).factorised()
+    shortened = False
     while iterations < max_iterations:
         iterations += 1
         step = factor.solve(-system.gradient)
         if -float(np.vdot(step, system.gradient)) < gain_tolerance:
             knots, system = knots.retract(step), apply_linear_step(system, knot_index, step)
             break
-        candidate, candidate_knots = _line_search(evaluate, knots, step, system)
-        if candidate is None:
-            break
+        moved, candidate = knots.retract(step), None
+        # After a step that had to be shortened the next one is likely to be too.
+        if not shortened:
+            candidate = evaluate(moved)
+            shortened = not candidate.cost < system.cost + 0.1 * float(np.vdot(step, system.gradient))
+        if candidate is None or shortened:
+            fraction = _line_search(cost_at, knots, step, system, 1.0 if candidate is None else 0.5)
+            if fraction is None:
+                break
+            moved, shortened = knots.retract(fraction * step), fraction < 1.0
+            candidate = evaluate(moved)
         decrease = system.cost - candidate.cost
-        knots = candidate_knots
+        knots = moved
         factor, system = candidate.factorised()
         del candidate
         if decrease < COST_TOLERANCE:
@@ -229,18 +244,19 @@ def _minimise(
 
 
 def _line_search(
-    evaluate: Callable[[States], NormalEquations], knots: States, step: FloatArray, system: NormalEquations
-) -> tuple[NormalEquations | None, States]:
-    """Backtrack along a step until the cost decreases sufficiently; None where rounding hides any decrease."""
+    cost_at: Callable[[States], float],
+    knots: States,
+    step: FloatArray,
+    system: NormalEquations,
+    fraction: float,
+) -> float | None:
+    """Halve a fraction of a step until the cost decreases sufficiently; None where rounding hides any decrease."""
     predicted_decrease = -float(np.vdot(step, system.gradient))
-    fraction = 1.0
     while fraction > MIN_STEP_FRACTION:
-        candidate_knots = knots.retract(fraction * step)
-        candidate = evaluate(candidate_knots)
-        if candidate.cost < system.cost - 0.1 * fraction * predicted_decrease:
-            return candidate, candidate_knots
+        if cost_at(knots.retract(fraction * step)) < system.cost - 0.1 * fraction * predicted_decrease:
+            return fraction
         fraction /= 2.0
-    return None, knots
+    return None
 
 
 def assemble(
@@ -305,6 +321,11 @@ def assemble(
     return NormalEquations(
         diagonal, off_diagonal, gradient, cost, squared_distances, weights, linearised, whitened
     )
+
+
+def _anchor_cost(knots: States, anchor: AnchorPrior) -> float:
+    error = knots.select(slice(0, 1)).local_coordinates_about(anchor.linearisation_point)[0] - anchor.mean
+    return float(error @ anchor.information @ error)
 
 
 def robust_loss(

@@ -91,11 +91,47 @@ def linearise(
     docs/explanation/continuous-trajectory.md derives the Jacobians.
     """
     delta_s = (observations.time_s - knots.time_s[knot_index])[:, None]
-    half_delta_s2 = 0.5 * delta_s**2
     lever_arm = observations.layout[observations.prism]
     states = knots.select(knot_index)
     if not delta_s.any():
         return _linearise_at_knots(observations, states, lever_arm)
+    half_delta_s2 = 0.5 * delta_s**2
+    delta_R, J_r, rotation, point, velocity = _propagated(states, delta_s, lever_arm)
+    residuals, by_point = _residuals_by_point(observations, point)
+    jacobian = np.empty((len(observations), 3, 18))
+    by_rotation = -by_point @ rotation @ skew(lever_arm)
+    by_delta_rotation = by_rotation @ J_r
+    jacobian[:, :, 0:3] = by_point
+    jacobian[:, :, 3:6] = by_rotation @ delta_R.swapaxes(1, 2)
+    jacobian[:, :, 6:9] = by_point * delta_s[:, None]
+    jacobian[:, :, 9:12] = by_delta_rotation * delta_s[:, None]
+    jacobian[:, :, 12:15] = by_point * half_delta_s2[:, None]
+    jacobian[:, :, 15:18] = by_delta_rotation * half_delta_s2[:, None]
+    return LinearisedMeasurements(residuals, jacobian, by_point, point, velocity, rotation)
+
+
+def squared_distances_at(
+    observations: Observations, knots: States, knot_index: NDArray[np.intp]
+) -> FloatArray:
+    """(M,) squared Mahalanobis distances of measurements from a trajectory, without the Jacobians of :func:`linearise`."""
+    delta_s = (observations.time_s - knots.time_s[knot_index])[:, None]
+    lever_arm = observations.layout[observations.prism]
+    *_, point, velocity = _propagated(knots.select(knot_index), delta_s, lever_arm)
+    residuals_m, by_point = _residuals_by_point(observations, point)
+    sigmas_m = observations.sigmas_m
+    by_time = matvec(by_point, velocity) * (observations.time_sigma_s[:, None] / sigmas_m)
+    residuals = residuals_m / sigmas_m
+    # The covariance is diagonal plus rank one.
+    along = dot(by_time, residuals)
+    distances: FloatArray = dot(residuals, residuals) - along**2 / (1.0 + dot(by_time, by_time))
+    return distances
+
+
+def _propagated(
+    states: States, delta_s: FloatArray, lever_arm: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Rotation since M states, (M, 3, 3), its right Jacobian, rotation then, and position and velocity of prisms, (M, 3)."""
+    half_delta_s2 = 0.5 * delta_s**2
     delta_R, J_r = exp_and_right_jacobian(
         states.angular_velocity * delta_s + states.angular_acceleration * half_delta_s2
     )
@@ -110,17 +146,7 @@ def linearise(
     velocity = (
         states.velocity + states.acceleration * delta_s + matvec(rotation, cross(angular_velocity, lever_arm))
     )
-    residuals, by_point = _residuals_by_point(observations, point)
-    jacobian = np.empty((len(observations), 3, 18))
-    by_rotation = -by_point @ rotation @ skew(lever_arm)
-    by_delta_rotation = by_rotation @ J_r
-    jacobian[:, :, 0:3] = by_point
-    jacobian[:, :, 3:6] = by_rotation @ delta_R.swapaxes(1, 2)
-    jacobian[:, :, 6:9] = by_point * delta_s[:, None]
-    jacobian[:, :, 9:12] = by_delta_rotation * delta_s[:, None]
-    jacobian[:, :, 12:15] = by_point * half_delta_s2[:, None]
-    jacobian[:, :, 15:18] = by_delta_rotation * half_delta_s2[:, None]
-    return LinearisedMeasurements(residuals, jacobian, by_point, point, velocity, rotation)
+    return delta_R, J_r, rotation, point, velocity
 
 
 def _linearise_at_knots(

@@ -171,12 +171,7 @@ def linearise_process(
         from_given = fast_log_so3(given.swapaxes(1, 2) @ knots.rotation[:1])
         rotvecs, extra = np.concatenate([from_given, rotvec]), 1
     magnus = (dt_s**2 / 12)[:, None]
-    states = np.empty((count + 1, 6, 3))
-    states[:, :3, 1], states[:, 3:, 1] = knots.velocity, knots.angular_velocity
-    states[:, :3, 2], states[:, 3:, 2] = knots.acceleration, knots.angular_acceleration
-    earlier, later = states[:-1].copy(), states[1:].copy()
-    earlier[:, :, 0] = 0.0
-    later[:, :3, 0] = knots.position[1:] - knots.position[:-1]
+    earlier, later = _axes(knots)
     later[:, 3:, 0] = rotvec - magnus * cross(before, after)
     by_earlier, by_later = np.empty((count, 3, 6)), np.empty((count, 3, 6))
     J_r_invs = inverse_right_jacobian(rotvecs)
@@ -190,6 +185,32 @@ def linearise_process(
         *(earlier, later, residuals, by_earlier, by_later),
         None if given is None else (rotvecs[0], J_r_invs[0]),
     )
+
+
+def process_cost(knots: States, factors: ProcessFactors) -> float:
+    """Sum of squared Mahalanobis distances of the process factors, as :func:`add_process_factors` returns it."""
+    before, after = knots.angular_velocity[:-1], knots.angular_velocity[1:]
+    dt_s = knots.time_s[1:] - knots.time_s[:-1]
+    earlier, later = _axes(knots)
+    later[:, 3:, 0] = rotation_between(knots.select(slice(None, -1)), knots.select(slice(1, None))) - (
+        dt_s**2 / 12
+    )[:, None] * cross(before, after)
+    residuals = later - matvec(factors.phi, earlier)
+    cost = float((residuals * matvec(factors.information, residuals)).sum())
+    if factors.rest is not None:
+        cost += float((factors.rest * (earlier[:, :, 1] ** 2 + later[:, :, 1] ** 2)).sum())
+    return cost
+
+
+def _axes(knots: States) -> tuple[FloatArray, FloatArray]:
+    """``earlier`` and ``later`` of :class:`LinearisedProcess`, without the rotation vectors."""
+    states = np.empty((len(knots), 6, 3))
+    states[:, :3, 1], states[:, 3:, 1] = knots.velocity, knots.angular_velocity
+    states[:, :3, 2], states[:, 3:, 2] = knots.acceleration, knots.angular_acceleration
+    earlier, later = states[:-1].copy(), states[1:].copy()
+    earlier[:, :, 0] = 0.0
+    later[:, :3, 0] = knots.position[1:] - knots.position[:-1]
+    return earlier, later
 
 
 def add_process_factors(

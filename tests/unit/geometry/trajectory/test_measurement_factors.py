@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import cartesian_to_polar, invert, polar_to_cartesian, transform_from, transform_points
 from tsgt.geometry.trajectory import STATE_DIM, Observations, States, linearise
-from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes
+from tsgt.geometry.trajectory.measurement_factors import line_of_sight_axes, squared_distances_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -111,6 +111,20 @@ def test_jacobian_is_exact(seed: int) -> None:
             linearise(observations, knots.retract(sign * error), at).residuals_m for sign in (1, -1)
         )
         np.testing.assert_allclose(found[:, :, part], (forth - back) / (2 * step), atol=3e-8)
+
+
+@settings(derandomize=True, max_examples=40)
+@given(st.integers(0, 10**6))
+def test_distances_alone_are_those_of_whitened_residuals(seed: int) -> None:
+    """Whatever the offsets from the knots, with time noise."""
+    rng = np.random.default_rng(seed)
+    knots = tumbling(rng)
+    observations = observed(knots, rng, offset_s=rng.choice([0.0, 0.2]))
+    at = knot_index(observations, knots)
+    residuals = linearise(observations, knots, at).whitened(observations)[:, :, -1]
+    np.testing.assert_allclose(
+        squared_distances_at(observations, knots, at), (residuals**2).sum(axis=1), rtol=1e-9
+    )
 
 
 @settings(derandomize=True, max_examples=40)

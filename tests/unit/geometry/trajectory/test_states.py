@@ -19,6 +19,7 @@ from tsgt.geometry.trajectory.states import (
     add_process_factors,
     axes_to_state,
     linearise_process,
+    process_cost,
     rotation_between,
 )
 from tsgt.model import MotionPrior
@@ -143,6 +144,21 @@ def test_process_factors_in_the_normal_equations(seed: int) -> None:
         gradient.ravel(), np.einsum("nia,ni->a", jacobian, pulled), rtol=1e-7, atol=1e-6
     )
     assert cost == pytest.approx(float(np.vdot(pulled, found.residuals)))
+
+
+@settings(derandomize=True, max_examples=20)
+@given(st.integers(0, 10**6), st.booleans())
+def test_cost_alone_is_that_of_the_normal_equations(seed: int, resting: bool) -> None:  # noqa: FBT001
+    """With and without rest."""
+    knots = wild_knots(seed)
+    rest = np.random.default_rng(seed).uniform(0.0, 1e4, (len(knots) - 1, 6)) if resting else None
+    steps = ProcessFactors.of(knots.time_s, PRIOR, rest=rest)
+    count = len(knots)
+    matrices = np.zeros((count, STATE_DIM, STATE_DIM)), np.zeros((count - 1, STATE_DIM, STATE_DIM))
+    cost = add_process_factors(
+        linearise_process(knots, steps), steps, *matrices, np.zeros((count, STATE_DIM))
+    )
+    assert process_cost(knots, steps) == pytest.approx(cost, rel=1e-9)
 
 
 def test_expected_step_has_no_residual() -> None:

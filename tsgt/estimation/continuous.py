@@ -22,7 +22,7 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
-from tsgt.estimation.poses_ahead import PosesAhead
+from tsgt.estimation.poses_ahead import PosesAhead, SmoothedStatesAhead
 from tsgt.estimation.setup_uncertainty import InertialSetupUncertainty, setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
@@ -91,6 +91,7 @@ class ContinuousEstimator:
         self._next_smoothed_ns = 0
         self._first_epoch_ns = 0
         self._ahead = PosesAhead(self._without_imu, self._poses, self._limits.period_ns)
+        self._smoothed_ahead = SmoothedStatesAhead(self._limits.period_ns)
         # The oldest epoch first. The window still has the states: a delay is below the lag.
         self._delays_ns = [*sorted(self._limits.smoothed_delays_ns, reverse=True), 0]
         # In whole periods
@@ -243,7 +244,7 @@ class ContinuousEstimator:
             if self._imu is None:
                 numbers = self._ahead.due(epoch_ns, ages_ns, self._origin_ns)
             else:
-                states, covariance, common = self._states_at(time_s)
+                states, covariance, common = self._states_at(stamps_ns)
                 numbers = self._poses.numbers(states, self._with_allowance(covariance), common)
                 if jump_from is not None:
                     jump = self._poses.distance(jump_from, states.select(slice(-1, None)))
@@ -263,15 +264,17 @@ class ContinuousEstimator:
             batch.jump[-1] = jump
         return self._with_imu_use(batch)
 
-    def _states_at(self, time_s: FloatArray) -> tuple[States, FloatArray, FloatArray | None]:
-        """Return states, their covariance and its common part at times: smoothed, and at the last one predicted."""
-        states, covariance = self._window.predict(float(time_s[-1]), dim=_POSE_DIM)
-        common = self._window.common_at(float(time_s[-1]), dim=_POSE_DIM)
-        if len(time_s) == 1:
+    def _states_at(self, stamps_ns: list[int]) -> tuple[States, FloatArray, FloatArray | None]:
+        """Return states, their covariance and its common part at epochs: smoothed, and at the last one predicted."""
+        *smoothed_ns, epoch_ns = stamps_ns
+        time_s = float((epoch_ns - self._origin_ns) / 1e9)
+        states, covariance = self._window.predict(time_s, dim=_POSE_DIM)
+        common = self._window.common_at(time_s, dim=_POSE_DIM)
+        if not smoothed_ns:
             return states, covariance, common
-        trajectory = self._window.smoothed_trajectory()
-        smoothed, smoothed_covariance = trajectory.at(time_s[:-1], dim=_POSE_DIM)
-        smoothed_common = trajectory.common_at(time_s[:-1], dim=_POSE_DIM)
+        smoothed, smoothed_covariance, smoothed_common = self._smoothed_ahead.at(
+            self._window.smoothed_trajectory(), smoothed_ns, self._origin_ns
+        )
         if common is not None and smoothed_common is not None:
             common = np.concatenate([smoothed_common, common])
         return (

@@ -80,6 +80,11 @@ _KEPT_BEFORE_START_NS = 5_000_000_000  # of samples, before the first measuremen
 class QueriedTrajectory(Protocol):
     """A trajectory with its uncertainty, over the times of a window."""
 
+    @property
+    def settled_until_s(self) -> float:
+        """Time up to which states stay the same, whatever arrives."""
+        ...
+
     def at(self, time_s: FloatArray, *, dim: int = ...) -> tuple[States, FloatArray]:
         """Return states at N times, and the (N, dim, dim) covariance of their leading error components."""
         ...

@@ -13,9 +13,10 @@ import numpy as np
 from tsgt.geometry.trajectory import concatenate_states
 
 if TYPE_CHECKING:
+    from tsgt.estimation.imu_takeover import QueriedTrajectory
     from tsgt.estimation.pose_output import ContinuousPoseOutput, PoseNumbers
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.trajectory import FixedLagSmoother, Predictions
+    from tsgt.geometry.trajectory import FixedLagSmoother, Predictions, States
 
 EPOCHS = 3  # Seven measurements a second come for 20 epochs a second
 
@@ -66,6 +67,40 @@ class PosesAhead:
         self._numbers = self._output.numbers(states, covariance, common)
         self._rows = {key: row for row, key in enumerate([*predicted, *smoothed])}
         self._revision = self._smoother.revision
+
+
+class SmoothedStatesAhead:
+    """Smoothed states of any window at epochs, which are multiples of a period; new ones for each trajectory."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._trajectory: QueriedTrajectory | None = None
+        self._rows: dict[int, int] = {}  # By epoch
+        self._found: tuple[States, FloatArray, FloatArray | None] | None = None
+
+    def at(
+        self, trajectory: QueriedTrajectory, stamps_ns: list[int], origin_ns: int
+    ) -> tuple[States, FloatArray, FloatArray | None]:
+        """Return states at epochs, the covariance of their poses, and its common part; ``origin_ns``: of the trajectory's times."""
+        if (max(stamps_ns) - origin_ns) / 1e9 > trajectory.settled_until_s:
+            return _poses(trajectory, stamps_ns, origin_ns)
+        if trajectory is not self._trajectory or any(each not in self._rows for each in stamps_ns):
+            following = (each + i * self._period_ns for each in stamps_ns for i in range(1, EPOCHS))
+            settled_ns = origin_ns + 1e9 * trajectory.settled_until_s
+            ahead_ns = sorted({*stamps_ns, *(each for each in following if each <= settled_ns)})
+            self._trajectory, self._found = trajectory, _poses(trajectory, ahead_ns, origin_ns)
+            self._rows = {each: row for row, each in enumerate(ahead_ns)}
+        assert self._found is not None  # noqa: S101 (computed above)
+        states, covariance, common = self._found
+        rows = np.array([self._rows[each] for each in stamps_ns])
+        return states.select(rows), covariance[rows], None if common is None else common[rows]
+
+
+def _poses(
+    trajectory: QueriedTrajectory, stamps_ns: list[int], origin_ns: int
+) -> tuple[States, FloatArray, FloatArray | None]:
+    time_s = (np.array(stamps_ns, dtype=np.int64) - origin_ns) / 1e9
+    return (*trajectory.at(time_s, dim=_POSE_DIM), trajectory.common_at(time_s, dim=_POSE_DIM))
 
 
 def _times_s(keys: list[tuple[int, int]], origin_ns: int) -> FloatArray:

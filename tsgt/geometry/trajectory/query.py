@@ -56,6 +56,11 @@ class Trajectory:
     common: tuple[FloatArray, FloatArray] | None = None
     process_noise_share: float = 1.0  # Of the prior's variances between the knots
 
+    @property
+    def settled_until_s(self) -> float:
+        """Time of the last knot."""
+        return float(self.knots.time_s[-1])
+
     def common_at(self, time_s: FloatArray, *, dim: int = STATE_DIM) -> FloatArray | None:
         """Return the (N, dim, dim) covariance of states at N times that the set-up's uncertainty adds; None: unknown."""
         if self.common is None:

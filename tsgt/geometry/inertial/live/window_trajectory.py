@@ -30,6 +30,12 @@ class WindowTrajectory:
     predict: Callable[[float, int], tuple[States, FloatArray]]
     predicted_common: Callable[[float, int], FloatArray]
 
+    @property
+    def settled_until_s(self) -> float:
+        """Time up to which states do not depend on samples that arrive later; a single knot has no inside."""
+        knots_s = self.inside.knots.time_s
+        return float(knots_s[-1]) if len(knots_s) > 1 else -np.inf
+
     def at(self, time_s: FloatArray, *, dim: int = POSE_DIM) -> tuple[States, FloatArray]:
         """Return states of the reference point at N times, and the (N, 6, 6) covariance of poses.
 
@@ -62,9 +68,8 @@ class WindowTrajectory:
         return np.concatenate(known)[_order(beyond)] if known else np.empty((0, dim, dim))
 
     def _beyond(self, time_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether times are predicted; a single knot has no inside."""
-        knots_s = self.inside.knots.time_s
-        return time_s > knots_s[-1] if len(knots_s) > 1 else np.ones(len(time_s), np.bool_)
+        """Whether times are predicted."""
+        return time_s > self.settled_until_s
 
 
 def _order(beyond: NDArray[np.bool_]) -> NDArray[np.intp]:

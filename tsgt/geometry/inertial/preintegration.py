@@ -207,9 +207,9 @@ def preintegrate_with_matrices(
 
 
 def _biases(count: int, gyro_bias: FloatArray, accelerometer_bias: FloatArray) -> FloatArray:
-    return np.concatenate(
-        [np.broadcast_to(gyro_bias, (count, 3)), np.broadcast_to(accelerometer_bias, (count, 3))], axis=1
-    )
+    biases = np.empty((count, 6))
+    biases[:, :3], biases[:, 3:] = gyro_bias, accelerometer_bias
+    return biases
 
 
 class _Part(NamedTuple):

@@ -95,22 +95,25 @@ class HealthMonitor:
 
     def samples(self, new: InertialSamples) -> NDArray[np.bool_]:
         """Judge samples in the order of time; return which, (N,), can be used but for those after :attr:`stuck_from_s`."""
-        rates, forces = new.angular_rate_radps, new.specific_force_mps2
-        sound: NDArray[np.bool_] = np.isfinite(np.concatenate([rates, forces], axis=1)).all(axis=1)
-        sound &= (np.abs(rates).max(axis=1) < MAX_RATE_RADPS) & (np.abs(forces).max(axis=1) < MAX_FORCE_MPS2)
+        # NaN is below no limit.
+        largest_rates, largest_forces = (
+            np.maximum.reduce(np.abs(each), axis=1)
+            for each in (new.angular_rate_radps, new.specific_force_mps2)
+        )
+        sound: NDArray[np.bool_] = (largest_rates < MAX_RATE_RADPS) & (largest_forces < MAX_FORCE_MPS2)
         if not sound.all():
             self._report("values beyond any measuring range", float(new.end_s[~sound][-1]))
-        blows: NDArray[np.bool_] = np.abs(forces).max(axis=1) > BLOW_MPS2
-        blows &= sound
+        blows: NDArray[np.bool_] = sound & (largest_forces > BLOW_MPS2)
         if blows.any():
             self.setup_in_doubt = self.blow = True
             self._report("a blow may have displaced it", float(new.end_s[blows][-1]))
         unchanged, at_limit = self._saturation.samples(new)
         self._check_stuck(new, unchanged)
-        for sensor, columns in (("angular rate", slice(0, 3)), ("specific force", slice(3, 6))):
-            rows = np.flatnonzero(at_limit[:, columns].any(axis=1))
-            if len(rows):
-                self._report(f"the {sensor} is at the limit of the device", float(new.end_s[rows[-1]]))
+        if at_limit.any():
+            for sensor, columns in (("angular rate", slice(0, 3)), ("specific force", slice(3, 6))):
+                rows = np.flatnonzero(at_limit[:, columns].any(axis=1))
+                if len(rows):
+                    self._report(f"the {sensor} is at the limit of the device", float(new.end_s[rows[-1]]))
         self._newest_s = max(self._newest_s, float(new.end_s[-1]))
         self._now_s = max(self._now_s, self._newest_s)
         sound &= ~(blows | at_limit.any(axis=1))

@@ -55,7 +55,7 @@ class SaturationMonitor:
         same = np.zeros(values.shape, np.bool_)
         changes = np.abs(values[1:] - values[:-1])
         # Of a sensor as a whole: the product mixes its axes, of which one may be zero.
-        largest = np.abs(values.reshape(-1, 2, 3)).max(axis=2)
+        largest = np.maximum.reduce(np.abs(values.reshape(-1, 2, 3)), axis=2)
         largest = np.maximum(largest[1:], largest[:-1])
         same[1:] = (changes.reshape(-1, 2, 3) <= _ROUNDING * largest[:, :, None]).reshape(-1, 6)
         unchanged = np.logical_and.reduce(same[before:], axis=1)
@@ -145,8 +145,8 @@ class SaturationMonitor:
 def _most_frequent(values: FloatArray) -> NDArray[np.intp]:
     """How often the most frequent value of each column of (M, C) occurs, (C,)."""
     ordered = np.sort(values, axis=0)
-    differs = np.diff(ordered, axis=0) > _ROUNDING * np.abs(ordered[:-1])
+    differs = ordered[1:] - ordered[:-1] > _ROUNDING * np.abs(ordered[:-1])
     rows = np.arange(1, len(values))[:, None]
     before = np.maximum.accumulate(np.where(differs, rows, 0), axis=0)
-    found: NDArray[np.intp] = (rows - before).max(axis=0, initial=0) + 1
+    found: NDArray[np.intp] = np.maximum.reduce(rows - before, axis=0, initial=0) + 1
     return found

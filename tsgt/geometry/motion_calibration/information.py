@@ -26,6 +26,14 @@ class Information(NamedTuple):
         quadratic = float(projected @ np.linalg.solve(normal, projected))
         return 0.5 * (quadratic - float(np.linalg.slogdet(normal)[1]))
 
+    def max_evidence(self, least: FloatArray, most: FloatArray) -> float:
+        """Upper bound of the evidence of all priors that include ``least`` and are included in ``most``.
+
+        A wider prior fits better, and costs at least what ``least`` costs.
+        """
+        fitted = self.evidence(most) + 0.5 * float(np.linalg.slogdet(self.normal(most))[1])
+        return fitted - 0.5 * float(np.linalg.slogdet(self.normal(least))[1])
+
     def coordinates(self, factor: FloatArray) -> FloatArray:
         """(r,) most probable errors in the coordinates of a prior's factor."""
         return np.asarray(np.linalg.solve(self.normal(factor), factor.T @ self.vector))

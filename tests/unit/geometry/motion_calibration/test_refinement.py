@@ -11,6 +11,7 @@ from harness.drive import LAYOUT, MOTION_PRIOR, drive
 
 from tsgt.geometry import exp_so3
 from tsgt.geometry.motion_calibration import Setup, SetupParameters, calibrated_covariance, refine_setup
+from tsgt.geometry.motion_calibration.information import Information
 from tsgt.model import SetupCovariance
 
 if TYPE_CHECKING:
@@ -52,6 +53,22 @@ def test_clean_data_are_left_alone() -> None:
     assert found.p_value > 0.01
     assert not any(each.selected for each in found.evidence)
     assert found.setup is found.parameters.reference
+
+
+def test_noise_is_not_tuned_again_for_a_set_up_that_explains_nothing() -> None:
+    """Clean data: the prior is the given one."""
+    assert refined(drive(60.0, seed=3)).motion_prior is MOTION_PRIOR
+
+
+def test_evidence_is_bounded() -> None:
+    """No prior between the narrowest and the widest has more evidence than the bound."""
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(6, 6))
+    information = Information(root @ root.T, rng.normal(scale=5.0, size=6))
+    columns = rng.normal(size=(6, 10))
+    bound = information.max_evidence(columns[:, :2], columns)
+    between = [information.evidence(columns[:, : 2 + number]) for number in range(9)]
+    assert max(between) < bound < max(between) + 20.0
 
 
 @pytest.mark.slow

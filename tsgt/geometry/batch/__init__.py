@@ -6,6 +6,7 @@ The factors and the solver are those of ``geometry.trajectory``.
 
 from tsgt.geometry.batch.fit import TrajectoryFit, TrajectoryInPieces, TrajectoryPiece, fit_trajectory
 from tsgt.geometry.batch.hyperparameters import NOISE_FLOOR_SHARE, tune, with_noise_floor
+from tsgt.geometry.batch.knots import shared_knot_times
 from tsgt.geometry.batch.noise_scales import overall_scale, scale_noise
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "fit_trajectory",
     "overall_scale",
     "scale_noise",
+    "shared_knot_times",
     "tune",
     "with_noise_floor",
 ]

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.gauss_newton import Solution
 
-ADAPTATIONS = 3
+ADAPTATIONS = 2
 HALF_WINDOW_S = 1.0  # Of the mean of the squared distances: a manoeuvre lasts about a second
-PRIOR_STEPS = 8.0  # Steps that agree with the sigma, added to the mean: about as many as a window has
+PRIOR_STEPS = 5.0  # Steps that agree with the sigma, added to the mean: half as many as a window has
 EXTRAPOLATION = 6.0
 """Power of the ratio by which a variance is scaled. A single step goes a small part of the way, because the measurements determine
-only part of each residual; this many more go as far as three steps can without overshooting."""
+only part of each residual; this many more go as far as two steps can without overshooting."""
 
 MIN_VARIANCE_RATIO, MAX_VARIANCE_RATIO = 0.1, 10.0
 _AXES_TOGETHER = ((0, 1), (2,), (3, 4), (5,))  # As in the tuned prior: x and y, z, roll and pitch, yaw

@@ -2,7 +2,7 @@
 
 A long recording is solved in overlapping segments, which bounds the memory for the equations; measurements half a minute
 away carry no information about a state, so that the result equals that of one segment to far below the noise. The whole
-takes about 140 MB per hour of 3 stations at 2.5 Hz, and 280 MB with the part of the covariance that the states share; who
+takes about 95 MB per hour of 3 stations at 2.5 Hz, and 190 MB with the part of the covariance that the states share; who
 asks for poses alone takes it piece by piece.
 """
 
@@ -21,6 +21,7 @@ from tsgt.geometry.batch.hyperparameters import (
     tune,
     with_noise_floor,
 )
+from tsgt.geometry.batch.knots import shared_knot_times
 from tsgt.geometry.batch.noise_scales import scale_noise
 from tsgt.geometry.rest import (
     RestInterval,
@@ -34,7 +35,6 @@ from tsgt.geometry.trajectory.gauss_newton import (
     LOOSE_GAIN_TOLERANCE,
     PREDICTED_GAIN_TOLERANCE,
     REJECTION_THRESHOLD,
-    knot_times,
     nearest_knots,
     solve,
 )
@@ -56,20 +56,16 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
     from tsgt.geometry.trajectory.states import States
 
-KNOTS_PER_SEGMENT = 1536  # 200 s of 3 stations at 2.5 Hz: the overlaps add an eighth to the work
+KNOTS_PER_SEGMENT = 1024  # 200 s of 3 stations at 2.5 Hz: the overlaps add an eighth to the work
 MAX_ADAPTED_ITERATIONS = (
     6  # From the solution before the last adaptation, which is close; two or three suffice
 )
-ADAPTATION_GAIN_TOLERANCE = 100.0
-"""As :data:`~tsgt.geometry.trajectory.gauss_newton.LOOSE_GAIN_TOLERANCE`, before all but the last adaptation: a third of a sigma for
-each of a thousand knots. The next solution relinearises, and the last one converges; the result differs by 0.01 sigmas at most.
+INITIAL_GAIN_PER_KNOT, ADAPTATION_GAIN_PER_KNOT, FINAL_GAIN_PER_KNOT = 3.0, 0.3, 0.05
+"""As :data:`~tsgt.geometry.trajectory.gauss_newton.LOOSE_GAIN_TOLERANCE`, per knot: before the first adaptation, 1.7 sigmas, before the
+last one, half a sigma, and after it, 0.2 sigmas, without blunders. Each solution relinearises; what is left after a step to other
+sigmas is a thousandth of its gain. A blunder moves a few knots by many sigmas, and small steps decide whether it is rejected.
 """
-INITIAL_GAIN_PER_KNOT, FINAL_GAIN_PER_KNOT = 3.0, 0.01
-"""The same per knot before the first adaptation, 1.7 sigmas, and after the last one, 0.1 sigmas, without blunders. The result
-differs by 0.02 sigmas at most, 0.0006 as root mean square. A blunder moves a few knots by many sigmas, and small steps decide
-whether it is rejected.
-"""
-OVERLAP_KNOTS = 96  # Knots on either side of a segment that are solved with it and discarded
+OVERLAP_KNOTS = 64  # Knots on either side of a segment that are solved with it and discarded
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +173,7 @@ class TrajectoryInPieces:
             scale_noise(observations, self.noise_scales), self.rest, observations.sigmas_m
         )
         self._prior, self._setup_jacobian = prior, setup_jacobian
-        self._times_s = times_s = knot_times(observations.time_s)
+        self._times_s = times_s = shared_knot_times(observations.time_s)
         self._knot_index = nearest_knots(times_s, observations.time_s)
         middle_s = 0.5 * (times_s[:-1] + times_s[1:])
         occluded = partially_occluded(observations.time_s, observations.prism, middle_s)
@@ -309,7 +305,7 @@ def _solve_adapting(
             sigmas=sigmas,
             rest=rest,
             max_iterations=MAX_ADAPTED_ITERATIONS,
-            gain_tolerance=final_tolerance if last else ADAPTATION_GAIN_TOLERANCE,
+            gain_tolerance=final_tolerance if last else ADAPTATION_GAIN_PER_KNOT * len(guess),
         )
     return _AdaptedSolution(solution, *solution.factor.marginals(), sigmas)
 

@@ -20,6 +20,7 @@ from tsgt.geometry.batch.average_information import (
     process_variates,
 )
 from tsgt.geometry.batch.evidence_search import Curved, maximise
+from tsgt.geometry.batch.knots import shared_knot_times
 from tsgt.geometry.batch.noise_scales import (
     MIN_SCALE,
     SCALE_SPREAD,
@@ -36,7 +37,6 @@ from tsgt.geometry.rest import find_rest, in_rest, rest_factors, steps_in_rest, 
 from tsgt.geometry.trajectory.gauss_newton import (
     LOOSE_GAIN_TOLERANCE,
     REJECTION_THRESHOLD,
-    knot_times,
     log_evidence,
     solve,
 )
@@ -269,7 +269,7 @@ def _without_blunders(observations: Observations) -> tuple[Observations, States]
 
     Return a first trajectory as well.
     """
-    guess = initial_guess(observations, knot_times(observations.time_s))
+    guess = initial_guess(observations, shared_knot_times(observations.time_s))
     solution = solve(
         observations, guess, MotionPrior(), gain_tolerance=LOOSE_GAIN_TOLERANCE, reject_outliers=False
     )
@@ -279,7 +279,7 @@ def _without_blunders(observations: Observations) -> tuple[Observations, States]
     if kept.all():
         return observations, solution.knots
     observations = observations.select(kept)
-    return observations, initial_guess(observations, knot_times(observations.time_s))
+    return observations, initial_guess(observations, shared_knot_times(observations.time_s))
 
 
 def log_parameters(prior: MotionPrior, scales: FloatArray) -> FloatArray:

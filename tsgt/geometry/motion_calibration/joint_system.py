@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.batch import scale_noise
+from tsgt.geometry.batch import scale_noise, shared_knot_times
 from tsgt.geometry.motion_calibration.timestamp_drift import SegmentInformation
 from tsgt.geometry.rigid import matvec
-from tsgt.geometry.trajectory import MIN_KNOT_SPACING_S, coupling, initial_guess, knot_times, solve
+from tsgt.geometry.trajectory import MIN_KNOT_SPACING_S, coupling, initial_guess, solve
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -118,7 +118,7 @@ def _solve_trajectory(
     knots = segment.knots
     # While the times hardly change, the last knots are close enough and a better initial guess.
     if knots is None or np.abs(setup.latencies_s - segment.latencies_s).max() > MIN_KNOT_SPACING_S / 2:
-        knots = initial_guess(observations, knot_times(observations.time_s))
+        knots = initial_guess(observations, shared_knot_times(observations.time_s))
         segment.latencies_s = setup.latencies_s
     solution = solve(observations, knots, prior, reject_outliers=False)
     segment.knots = solution.knots

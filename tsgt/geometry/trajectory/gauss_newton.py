@@ -113,13 +113,13 @@ class NormalEquations(NamedTuple):
         return factor, self._replace(diagonal=nothing, off_diagonal=nothing)
 
 
-def knot_times(time_s: FloatArray, *, min_spacing_s: float = MIN_KNOT_SPACING_S) -> FloatArray:
+def knot_times(time_s: FloatArray) -> FloatArray:
     """Choose knot times for measurements at times ``time_s``, (M,), in increasing order, at least one."""
-    bins = np.unique(np.round(time_s / min_spacing_s).astype(np.int64))
+    bins = np.unique(np.round(time_s / MIN_KNOT_SPACING_S).astype(np.int64))
     # The mean of its measurements' times: a single measurement has its knot exactly at its time.
-    index = np.searchsorted(bins, np.round(time_s / min_spacing_s).astype(np.int64))
+    index = np.searchsorted(bins, np.round(time_s / MIN_KNOT_SPACING_S).astype(np.int64))
     times: FloatArray = np.bincount(index, time_s) / np.bincount(index)
-    kept = np.concatenate([[True], np.diff(times) > 0.25 * min_spacing_s])
+    kept = np.concatenate([[True], np.diff(times) > 0.25 * MIN_KNOT_SPACING_S])
     return np.asarray(times[kept])
 
 

@@ -87,7 +87,7 @@ def test_prism_missing_for_a_minute(observations: Observations) -> None:
 
 def test_progress_goes_from_zero_to_one(observations: Observations, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares rise to 1."""
-    monkeypatch.setattr("tsgt.geometry.batch.fit.KNOTS_PER_SEGMENT", 200)
+    monkeypatch.setattr("tsgt.geometry.batch.fit.KNOTS_PER_SEGMENT", 50)
     shares: list[float] = []
     fit_trajectory(observations, prior=PRIOR, noise_scale=1.0, on_progress=shares.append)
     assert shares == sorted(shares)

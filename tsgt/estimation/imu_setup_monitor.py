@@ -44,6 +44,11 @@ UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 INTERVAL_NS = 20_000_000_000
 RESULT_NS = 2_000_000_000  # From the start of a check to its result; a slow computer takes a second
 
+MAX_FIT_ITERATIONS, MAX_JOINT_ITERATIONS = 40, 30
+"""Of a check that says something. Drives need up to 29 and 21. With prisms of another robot among the measurements a check took more,
+and ten times as long, while the master waited for its result; what comes of it is not to be trusted either.
+"""
+
 UNSAMPLED_S = 2.0  # By which measurements may precede the samples that they are compared with
 
 _POSE_DIM = 6
@@ -110,16 +115,49 @@ def check_recorded_setup(
             knots = with_imu.trajectory.knots
             states, _ = with_imu.trajectory.at(knots.time_s, dim=_POSE_DIM)
             bias = knots.gyro_bias.mean(axis=0)
-            return check_few_prisms(observations, states, bias, samples, mounting, imu.noise, Gravity.of(imu))
-        fit = fit_trajectory(observations, prior=parameters.pipeline.motion, noise_scale=1.0, rest=())
+            return check_few_prisms(
+                observations,
+                states,
+                bias,
+                samples,
+                mounting,
+                imu.noise,
+                Gravity.of(imu),
+                on_iteration=_WorkLimit(MAX_JOINT_ITERATIONS),
+            )
+        fit = fit_trajectory(
+            observations,
+            prior=parameters.pipeline.motion,
+            noise_scale=1.0,
+            rest=(),
+            on_iteration=_WorkLimit(MAX_FIT_ITERATIONS),
+        )
         return check_imu_setup(
-            fit.observations, fit.trajectory, samples, mounting, imu.noise, Gravity.of(imu)
+            fit.observations,
+            fit.trajectory,
+            samples,
+            mounting,
+            imu.noise,
+            Gravity.of(imu),
+            on_iteration=_WorkLimit(MAX_JOINT_ITERATIONS),
         )
     except (
         GeometryError,
         np.linalg.LinAlgError,
     ):  # Too few measurements or samples: there is nothing to compare
         return SetupCheck()
+
+
+class _WorkLimit:
+    """Ends a search that takes more iterations than measurements without gross outliers need."""
+
+    def __init__(self, iterations: int) -> None:
+        self._left = iterations
+
+    def __call__(self) -> None:
+        if not self._left:
+            raise GeometryError("the check of the IMU's set-up does not converge")
+        self._left -= 1
 
 
 class ImuSetupMonitor:

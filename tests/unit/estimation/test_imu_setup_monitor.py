@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING
@@ -265,6 +266,22 @@ def test_wrong_setup_is_noticed_within_a_minute(setup: Callable[[], Setup], mess
     (event,) = setup().events()
     assert event.event == "imu_setup_wrong"
     assert message in event.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("prism_numbers", [{1, 2}, {1, 2, 3}])
+def test_prisms_of_another_robot_say_nothing_of_the_setup(prism_numbers: set[int]) -> None:
+    """Followed in every other five seconds: a trajectory through them has false findings, and the search for it takes seconds."""
+
+    def followed(measurement: PointMeasurement) -> PointMeasurement:
+        at_s = (measurement.stamp_ns - drive().measurements[0].stamp_ns) / SECOND
+        if measurement.prism not in prism_numbers or at_s % 10.0 >= 5.0:
+            return measurement
+        x, y, z = measurement.position_m
+        return replace(measurement, position_m=(x + 4.0 + 0.5 * math.sin(at_s), y + 3.0, z + 0.2))
+
+    measurements = [followed(each) for each in drive().measurements]
+    assert check_recorded_setup(drive().parameters, measurements, drive().samples) == SetupCheck()
 
 
 @pytest.mark.slow

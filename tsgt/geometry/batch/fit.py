@@ -119,6 +119,7 @@ def fit_trajectory(
     rest: Sequence[RestInterval] | None = None,
     setup_jacobian: SetupJacobian | None = None,
     on_progress: Callable[[float], None] | None = None,
+    on_iteration: Callable[[], None] = lambda: None,
 ) -> TrajectoryFit:
     """Fit a trajectory.
 
@@ -133,6 +134,7 @@ def fit_trajectory(
     rest : Intervals in which the robot stands still; found in the measurements when not given.
     setup_jacobian : Sensitivity to the set-up's errors, for the part of the covariance that all states share.
     on_progress : Called with the completed share of the work, 0 to 1.
+    on_iteration : Called before each iteration of the solver, but not while tuning; what it raises ends the fit.
     """
     if prior is None or noise_scale is None:
         tuned = tune(observations, start=prior, noise_scale=noise_scale, noise_only=prior is not None)
@@ -147,6 +149,7 @@ def fit_trajectory(
         noise_scale=noise_scale,
         rest=rest,
         setup_jacobian=setup_jacobian,
+        on_iteration=on_iteration,
     )
     return in_pieces.joined(list(in_pieces.fitted(on_progress)))
 
@@ -166,13 +169,14 @@ class TrajectoryInPieces:
         occluded_prior: MotionPrior | None = None,
         rest: Sequence[RestInterval] | None = None,
         setup_jacobian: SetupJacobian | None = None,
+        on_iteration: Callable[[], None] = lambda: None,
     ) -> None:
         self.noise_scales = np.ones((len(observations.frames), 3)) * noise_scale
         self.rest = tuple(find_rest(observations) if rest is None else rest)
         self.observations = with_vibration(
             scale_noise(observations, self.noise_scales), self.rest, observations.sigmas_m
         )
-        self._prior, self._setup_jacobian = prior, setup_jacobian
+        self._prior, self._setup_jacobian, self._on_iteration = prior, setup_jacobian, on_iteration
         self._times_s = times_s = shared_knot_times(observations.time_s)
         self._knot_index = nearest_knots(times_s, observations.time_s)
         middle_s = 0.5 * (times_s[:-1] + times_s[1:])
@@ -228,7 +232,13 @@ class TrajectoryInPieces:
         rest = None if self._rest_information is None else self._rest_information[steps]
         guess = self._tracks.guess(self._times_s[segment.solved])
         found = _solve_adapting(
-            observations, guess, self._prior, self._sigmas[steps], rest, self._adaptable[steps]
+            observations,
+            guess,
+            self._prior,
+            self._sigmas[steps],
+            rest,
+            self._adaptable[steps],
+            self._on_iteration,
         )
         solution = found.solution
         start, stop = segment.kept.start - first, segment.kept.stop - first
@@ -270,6 +280,7 @@ def _solve_adapting(
     initial_sigmas: FloatArray,
     rest: FloatArray | None,
     adaptable: NDArray[np.bool_],
+    on_iteration: Callable[[], None],
 ) -> _AdaptedSolution:
     """Solve, and adapt the process noise to the motion; arguments as for :func:`solve` and :func:`adapted_sigmas`."""
     sigmas = initial_sigmas
@@ -281,12 +292,19 @@ def _solve_adapting(
         rest=rest,
         gain_tolerance=INITIAL_GAIN_PER_KNOT * len(guess),
         reject_outliers=False,
+        on_iteration=on_iteration,
     )
     final_tolerance = FINAL_GAIN_PER_KNOT * len(guess)
     if (solution.squared_distances > REJECTION_THRESHOLD**2).any():
         final_tolerance = PREDICTED_GAIN_TOLERANCE
         solution = solve(
-            observations, guess, prior, sigmas=sigmas, rest=rest, gain_tolerance=LOOSE_GAIN_TOLERANCE
+            observations,
+            guess,
+            prior,
+            sigmas=sigmas,
+            rest=rest,
+            gain_tolerance=LOOSE_GAIN_TOLERANCE,
+            on_iteration=on_iteration,
         )
     for last in (*[False] * (ADAPTATIONS - 1), True):
         sigmas = adapted_sigmas(
@@ -306,6 +324,7 @@ def _solve_adapting(
             rest=rest,
             max_iterations=MAX_ADAPTED_ITERATIONS,
             gain_tolerance=final_tolerance if last else ADAPTATION_GAIN_PER_KNOT * len(guess),
+            on_iteration=on_iteration,
         )
     return _AdaptedSolution(solution, *solution.factor.marginals(), sigmas)
 

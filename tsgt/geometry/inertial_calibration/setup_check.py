@@ -43,6 +43,8 @@ from tsgt.geometry.inertial_calibration.setup import (
 from tsgt.geometry.rigid import log_so3
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tsgt.geometry.inertial import Gravity, InertialSamples
     from tsgt.geometry.inertial_calibration.alignment import Products, Series
     from tsgt.geometry.rigid import FloatArray
@@ -130,6 +132,8 @@ def check_imu_setup(
     mounting: Mounting,
     noise: ImuNoise,
     gravity: Gravity,
+    *,
+    on_iteration: Callable[[], None] = lambda: None,
 ) -> SetupCheck:
     """Compare a configured IMU with a drive of up to a minute.
 
@@ -140,6 +144,7 @@ def check_imu_setup(
     observations : In the order of time, with the layout in the axes of the robot.
     trajectory : Of the robot at the reference point of the layout, from the stations alone.
     samples : Latency and gyro matrix as configured are applied.
+    on_iteration : Called before each iteration of the joint estimation; with a GeometryError it ends without a finding.
     mounting : As configured, from that reference point.
     noise : Of the data sheet.
     """
@@ -167,7 +172,9 @@ def check_imu_setup(
         return SetupCheck((gross,))
     right = abs(alignment.latency_s) < ALIGNED_S
     start = _Start(alignment.rotation, 0.0 if right else alignment.latency_s, alignment.gyro_bias)
-    found = _estimated_errors(observations, trajectory.knots, samples, mounting, noise, gravity, start)
+    found = _estimated_errors(
+        observations, trajectory.knots, samples, mounting, noise, gravity, start, on_iteration
+    )
     return replace(found, excluded=found.excluded | GROSS)
 
 
@@ -179,6 +186,8 @@ def check_few_prisms(
     mounting: Mounting,
     noise: ImuNoise,
     gravity: Gravity,
+    *,
+    on_iteration: Callable[[], None] = lambda: None,
 ) -> SetupCheck:
     """Compare a configured IMU with measurements of one or two prisms, as :func:`check_imu_setup`.
 
@@ -187,7 +196,7 @@ def check_few_prisms(
     if not turns(series_of_states(states, gravity)):
         return SetupCheck()
     start = _Start(mounting.rotation, 0.0, gyro_bias)
-    found = _estimated_errors(observations, states, samples, mounting, noise, gravity, start)
+    found = _estimated_errors(observations, states, samples, mounting, noise, gravity, start, on_iteration)
     return replace(found, excluded=found.excluded | GROSS)
 
 
@@ -266,6 +275,7 @@ def _estimated_errors(
     noise: ImuNoise,
     gravity: Gravity,
     start: _Start,
+    on_iteration: Callable[[], None],
 ) -> SetupCheck:
     """Find errors of mounting and latency by joint estimation."""
     filled = contiguous(samples, noise)
@@ -287,6 +297,7 @@ def _estimated_errors(
             SetupPrior.wide(configured, MATRIX_SIGMA),
             gravity,
             start=near,
+            on_iteration=on_iteration,
         )
     except GeometryError:
         return SetupCheck()

@@ -160,6 +160,7 @@ def solve(
     max_iterations: int = MAX_ITERATIONS,
     gain_tolerance: float = PREDICTED_GAIN_TOLERANCE,
     reject_outliers: bool = True,
+    on_iteration: Callable[[], None] = lambda: None,
 ) -> Solution:
     """Find the maximum a posteriori trajectory from observations in any order.
 
@@ -167,12 +168,13 @@ def solve(
     the first knot; diffuse when not given. ``sigmas``: (K - 1, 6) acceleration sigmas of each step instead of those of
     ``prior``; ``rest``: of :class:`ProcessFactors`. ``gain_tolerance``: see :data:`PREDICTED_GAIN_TOLERANCE`.
     ``reject_outliers``: solve a second time without measurements beyond :data:`REJECTION_THRESHOLD`; without, the solution is
-    a smooth function of its inputs. Raises GeometryError: the measurements do not determine the trajectory.
+    a smooth function of its inputs. ``on_iteration``: called before each; what it raises ends the search. Raises GeometryError: the
+    measurements do not determine the trajectory.
     """
     anchor = diffuse_prior(guess.select(slice(0, 1)), prior) if anchor is None else anchor
     knot_index = nearest_knots(guess.time_s, observations.time_s)
     process = ProcessFactors.of(guess.time_s, prior, sigmas, rest)
-    limits = max_iterations, gain_tolerance
+    limits = max_iterations, gain_tolerance, on_iteration
     found = _minimise(observations, knot_index, guess, process, anchor, *limits)
     if not reject_outliers or not (found.squared_distances > REJECTION_THRESHOLD**2).any():
         return found
@@ -201,6 +203,7 @@ def _minimise(
     anchor: AnchorPrior,
     max_iterations: int,
     gain_tolerance: float,
+    on_iteration: Callable[[], None],
     rejectable: NDArray[np.bool_] | None = None,
 ) -> Solution:
     """Run Gauss-Newton with backtracking until the cost or the predicted gain falls below its tolerance."""
@@ -217,6 +220,7 @@ def _minimise(
     factor, system = evaluate(knots).factorised()
     shortened = False
     while iterations < max_iterations:
+        on_iteration()
         iterations += 1
         step = factor.solve(-system.gradient)
         if -float(np.vdot(step, system.gradient)) < gain_tolerance:

@@ -78,7 +78,7 @@ def test_evo_agrees_with_evaluate(
     compared, position_m, rotation_deg, relative_m = evo_errors(other, files[estimator])
     assert compared == ours["compared"] > 100
     assert ours["position_rms_mm"] > 0.5
-    assert ours["position_rms_mm"] != pytest.approx(ours["centroid"]["position_rms_mm"], abs=0.1)
+    assert ours["position_rms_mm"] != pytest.approx(ours["centroid"]["position_rms_mm"], abs=0.05)
     assert position_m == pytest.approx(ours["position_rms_mm"] / 1e3, abs=1e-6)
     assert rotation_deg == pytest.approx(ours["orientation_rms_deg"], abs=1e-6)
     assert ours["ate"]["position_rms_mm"] == pytest.approx(ours["position_rms_mm"], abs=1e-9)

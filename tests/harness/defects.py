@@ -73,8 +73,8 @@ def acknowledge_before_written(planting: Planting) -> None:
 
     def acknowledge(link: Any) -> None:
         while link._unsynced:
-            reply = link._unsynced.popleft()
-            link._master.station(reply.station).window.mark_written(reply.sequences)
+            measurement = link._unsynced.popleft()
+            link._master.station(measurement.station).window.mark_written([measurement.sequence])
 
     planting.replace_attribute(link.SuperframeLink, "_acknowledge", lambda _: acknowledge)
 

@@ -37,10 +37,10 @@ log = structlog.get_logger()
 
 
 class _Unsynced(NamedTuple):
-    """The measurements of a reply, and the recording's lines that hold them."""
+    """A measurement, and the recording's lines that came with it: itself, and poses and events that it completes."""
 
     station: int
-    sequences: tuple[int, ...]
+    sequence: int
     lines: range
 
 
@@ -136,17 +136,15 @@ class SuperframeLink:
         report(link_events.StationResponded(station, packet.rssi_dbm, packet.snr_db))
         if reply.joined:
             log.info("station_joined", station=station)
-        first_line = self._recording.line_count
         received_ns = self._timeline.unix_ns(packet.received_at_ns)
         report(link_events.ReplyReceived(station))
         for timed in reply.measurements:
             measurement = self._measurement(station, timed, received_ns)
+            first_line = self._recording.line_count
             report(link_events.MeasurementReceived(measurement))
-            self._hints.measured(measurement)
-        if reply.measurements:
-            sequences = tuple(timed.sequence for timed in reply.measurements)
             lines = range(first_line, self._recording.line_count)
-            self._unsynced.append(_Unsynced(station, sequences, lines))
+            self._unsynced.append(_Unsynced(station, timed.sequence, lines))
+            self._hints.measured(measurement)
         if reply.rejected_beacons:
             report(link_events.BeaconTimeRejected(station, reply.rejected_beacons))
         if reply.link_delay_anomaly:
@@ -180,9 +178,9 @@ class SuperframeLink:
     def _acknowledge(self) -> None:
         """Mark measurements that are on the disk, or lost, for the next acknowledgement: a power cut takes none of them back."""
         while self._unsynced and (synced := self._recording.synced(self._unsynced[0].lines)) is not None:
-            reply = self._unsynced.popleft()
-            window = self._master.station(reply.station).window
-            (window.mark_written if synced else window.mark_lost)(reply.sequences)
+            unsynced = self._unsynced.popleft()
+            window = self._master.station(unsynced.station).window
+            (window.mark_written if synced else window.mark_lost)((unsynced.sequence,))
 
     def _report_state(self, reply: ReceivedReply, now_ns: int) -> None:
         """Report the state of a station, and command one to track that does not track its prism."""

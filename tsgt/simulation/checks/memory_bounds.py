@@ -22,7 +22,7 @@ STATED_BOUNDS = {
     ("_Reader", "_queue"): QUEUE_LINES,
     ("StationIngest", "_known"): DUPLICATE_WINDOW,
     ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
-    ("SuperframeLink", "_unsynced"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,  # replies whose lines wait there
+    ("SuperframeLink", "_unsynced"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,  # whose lines wait there
     ("SendQueue", "_queue"): QUEUE_CAPACITY,
     ("Backlog", "queued"): MAX_MEASUREMENTS,
     ("Backlog", "receptions"): MAX_RECEPTIONS,

@@ -29,8 +29,8 @@ MIN_PREDICTED_SQUARE = 0.6
 """The same of predicted poses of a moving robot, 1.1 to 2.2 in missions; at rest they must allow for a start."""
 
 MIN_INTERPOLATED_SQUARE = 0.4
-"""The same of interpolated poses, down to 0.6 in missions over ``classic``: their covariance allows for an acceleration at rest, too,
-and grows where residuals contradict it.
+"""The same of interpolated poses of a moving robot, down to 0.6 in missions over ``classic``: their covariance grows where residuals
+contradict it, and allows for an acceleration at rest, too.
 """
 
 SIGMAS = 2.0
@@ -42,6 +42,11 @@ BLOCK_S = 2.0
 MIN_SPEED_MPS = 0.2
 
 _STEP_S = 0.01
+
+_LIMITS = {
+    "predicted": MIN_PREDICTED_SQUARE,
+    "interpolated": MIN_INTERPOLATED_SQUARE,
+}  # while the robot moves
 
 
 def scale_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
@@ -56,9 +61,8 @@ def scale_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str
         poses = valid.select(valid.series == series)
         at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
         truth = result.true_poses(at_s)
-        limit = MIN_INTERPOLATED_SQUARE if series == "interpolated" else MIN_SQUARE
-        if series == "predicted":
-            limit = MIN_PREDICTED_SQUARE
+        limit = _LIMITS.get(series, MIN_SQUARE)
+        if series in _LIMITS:
             moved_m = result.true_poses(at_s + _STEP_S)[:, :3, 3] - truth[:, :3, 3]
             moving = np.linalg.norm(moved_m, axis=1) > MIN_SPEED_MPS * _STEP_S
             poses, at_s, truth = poses.select(moving), at_s[moving], truth[moving]

@@ -109,9 +109,9 @@ class ReplyBuilder:
     def _by_urgency(
         self, session: StationSession, slot_ns: int, max_measurements: int
     ) -> list[StampedMeasurement]:
-        """Return the timed measurements: the newest, then the oldest of a short queue or the next newer of a backlog; and the oldest.
+        """Return the timed measurements, the most urgent first.
 
-        The oldest comes first if the last replies have left it out.
+        Of a short queue the newest, and then from the oldest on; of a backlog newest first. The oldest of the queue is always among them, and comes first if the last replies have left it out.
         """
         urgent: list[StampedMeasurement] = []
 

@@ -26,6 +26,11 @@ class InertialSamples:
     angular_rate_radps: NDArray[np.float64]  # (N, 3) in the axes of the IMU
     specific_force_mps2: NDArray[np.float64]  # (N, 3) in the axes of the IMU
 
+    @classmethod
+    def none(cls) -> InertialSamples:
+        """Return no samples."""
+        return cls(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+
     def __len__(self) -> int:
         return len(self.end_s)
 

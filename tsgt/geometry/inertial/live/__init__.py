@@ -1,8 +1,9 @@
 """The trajectory with an IMU online: a window of knots that moves with time, and prediction to now. Sans-I/O.
 
 In: samples and measurements as they arrive, late ones too. Out: predicted and smoothed states with covariances, and whether the IMU
-is to be believed (`health`, `saturation`). `fixed_lag` updates the window (`window`); `window_trajectory` gives its states at any time; `prediction`
-integrates from its newest knot, and `rate_prediction` goes on where samples end; `known_rotation` carries a rotation over a loss.
+is to be believed (`health`, `saturation`). `start_search` finds a trajectory, `fixed_lag` updates its window (`window`) from `held_samples`;
+`window_trajectory` gives its states at any time; `prediction` integrates from its newest knot, and `rate_prediction` goes on where
+samples end; `known_rotation` carries a rotation over a loss.
 """
 
 from tsgt.geometry.inertial.live.fixed_lag import InertialFixedLagSmoother

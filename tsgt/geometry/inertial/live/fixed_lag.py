@@ -15,17 +15,16 @@ import numpy as np
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.inertial.anchor import InertialAnchor
-from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading
 from tsgt.geometry.inertial.live.health import HealthMonitor
+from tsgt.geometry.inertial.live.held_samples import HeldSamples
 from tsgt.geometry.inertial.live.known_rotation import KnownRotation
 from tsgt.geometry.inertial.live.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.live.rate_prediction import RotationPredictor
+from tsgt.geometry.inertial.live.start_search import DIFFUSE_SIGMAS, StartSearch
 from tsgt.geometry.inertial.live.window import KnotWindow, SolvedWindow, divided, factorise, propagate
 from tsgt.geometry.inertial.live.window_trajectory import POSE_DIM, WindowTrajectory
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
-from tsgt.geometry.inertial.preintegration import ContiguousSamples, contiguous
 from tsgt.geometry.inertial.query import InertialTrajectory
-from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
 from tsgt.geometry.inertial.sensitivity import InertialSensitivity, Linearised, by_mounting, of_gyro_alone
 from tsgt.geometry.inertial.smoother import estimation_noise
 from tsgt.geometry.inertial.solver import (
@@ -34,7 +33,6 @@ from tsgt.geometry.inertial.solver import (
     InertialSolution,
     apply_linear_step,
     diffuse_inertial_prior,
-    inertial_knot_times,
     solve_inertial,
 )
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, Gravity, Mounting
@@ -45,7 +43,6 @@ from tsgt.geometry.trajectory.gauss_newton import (
     OUTLIER_THRESHOLD,
     add_measurements,
     nearest_knots,
-    robust_loss,
 )
 from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
 from tsgt.geometry.trajectory.measurement_factors import merge_observations, time_order
@@ -63,6 +60,7 @@ if TYPE_CHECKING:
     from tsgt.geometry.inertial.bordered import BorderedCholesky
     from tsgt.geometry.inertial.factors import InertialEquations
     from tsgt.geometry.inertial.live.saturation import SaturationMonitor
+    from tsgt.geometry.inertial.samples import InertialSamples
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
     from tsgt.geometry.trajectory.sensitivity import SetupJacobian
@@ -70,27 +68,14 @@ if TYPE_CHECKING:
     from tsgt.model import ImuParameters, MotionPrior, OdometryParameters
 
 SEARCH_S = 40.0  # Longest stretch of measurements that the search over headings takes
-SEARCH_GROWTH = (
-    1.15  # Of that stretch from one search to the next: the search takes as long as twenty updates
-)
-MIN_SEARCH_STEP_S = 0.5
-MIN_PATH_M = 0.3  # Of a single prism: without motion it does not tell the heading
 CONSISTENT_ALONE = 5
 """Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
 each of them. A chance agreement of wrong ones within the gate, five times, is none.
-"""
-MAX_START_COST = 3.0
-"""Of a start, per degree of freedom, without its outliers; 1 is expected. The first measurements of a station that has moved
-agree with the others within a few sigmas each, but not together as right ones do.
 """
 MAX_ROTATION_SQUARES = 20.0
 """Of the rotation of a start against that from before, normalised, three components; 2 in 10,000 exceed it."""
 WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
 MAX_OUTAGE_S = 120.0  # Without measurements, after which the position is lost
-SAMPLES_MARGIN_S = 0.5  # Before the oldest knot: the sample before a knot tells where the next one begins
-
-_DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0], 3)
-"""Sigmas of position, rotation and velocity of the first state's error, once measurements determine it: as without an IMU."""
 
 
 class InertialFixedLagSmoother(MeasurementWindow):
@@ -117,20 +102,20 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._noise = estimation_noise(imu.noise)
         mounting = Mounting.of(imu, reference_m)
         self._mounting = replace(mounting, position=np.zeros(3)) if gyro_only else mounting
-        self._odometry = (
+        wheels = (
             None
             if odometry is None
             else Odometry.of(WheelSamples.none(), odometry, self._mounting, reference_m)
         )
+        self._held = HeldSamples(self._noise, wheels)
         self._prior, self._gyro_only = prior, prior if gyro_only else None
         gravity = Gravity.of(imu)
         if not gyro_only:
             gravity = gravity.with_matrix(imu.noise.accelerometer_scale_misalignment, mounting.rotation[2])
-        self._initial_gravity = self._gravity = gravity
+        self._gravity = gravity
+        self._search = StartSearch(self._noise, self._gyro_only, gravity)
         self._health = HealthMonitor(imu, saturation)
-        self._samples: InertialSamples | None = None
         self._rotation_predictor = RotationPredictor()
-        self._stale_from_s = np.inf  # Samples after this have arrived since the integration
         self._window: KnotWindow | None = None
         self._solved: SolvedWindow | None = None
         self._sensitivity: InertialSensitivity | None = None
@@ -146,7 +131,6 @@ class InertialFixedLagSmoother(MeasurementWindow):
         self._trajectory: WindowTrajectory | None = None
         self._predictor: StrapdownPredictor | None = None
         self._searched: Observations | None = None  # Also those before the horizon, while there is no start
-        self._next_search_s = -np.inf
         self._known: KnownRotation | None = None
 
     @property
@@ -168,7 +152,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
     @property
     def wheels(self) -> WheelsEstimate | None:
         """Newest scale, slip and direction of the wheel odometry, and how much of it is rejected; None without it or without a trajectory."""
-        if self._odometry is None or self._solved is None or self._predictor is None:
+        if self._held.odometry is None or self._solved is None or self._predictor is None:
             return None
         window = self._solved.window
         steps = window.factors.odometry
@@ -204,34 +188,16 @@ class InertialFixedLagSmoother(MeasurementWindow):
             return
         new = new.select(self._health.samples(new))
         self._rotation_predictor.learn(new)
-        held, stuck_s = self._samples, self._health.stuck_from_s
-        parts = [each.select(each.end_s <= stuck_s) for each in (held, new) if each is not None]
-        joined = concatenate_samples(parts)
-        from_s = stuck_s
-        if len(new):
-            if held is not None and len(held) and new.end_s[0] <= held.end_s[-1]:
-                order = np.argsort(joined.end_s, kind="stable")
-                # The first of two of the same interval.
-                joined = joined.select(order[np.diff(joined.end_s[order], prepend=-np.inf) > 0])
-            # The gap before the first of them ends there.
-            previous = int(joined.end_s.searchsorted(new.end_s[0])) - 1
-            from_s = min(from_s, float(joined.end_s[previous]) if previous >= 0 else -np.inf)
-        self._samples = joined
-        self._stale_from_s = min(self._stale_from_s, from_s)
-        if self._predictor is not None:
-            self._predictor.discard_after(from_s)
+        self._discard_predicted(self._held.add(new, self._health.stuck_from_s))
 
     def add_odometry(self, new: WheelSamples) -> None:
         """Add samples of the wheel odometry, in the order of time; they may precede others that were added before."""
-        if self._odometry is None or not len(new):
-            return
-        joined = self._odometry.samples.joined(new)
-        self._odometry = replace(self._odometry, samples=joined)
-        previous = int(joined.end_s.searchsorted(new.end_s[0])) - 1
-        from_s = float(joined.end_s[previous]) if previous >= 0 else -np.inf
-        self._stale_from_s = min(self._stale_from_s, from_s)
+        if self._held.odometry is not None and len(new):
+            self._discard_predicted(self._held.add_odometry(new))
+
+    def _discard_predicted(self, after_s: float) -> None:
         if self._predictor is not None:
-            self._predictor.discard_after(from_s)
+            self._predictor.discard_after(after_s)
 
     def marginalise_before(self, before_s: float) -> None:
         """Marginalise the states before a time; states from then on can still be queried."""
@@ -246,16 +212,10 @@ class InertialFixedLagSmoother(MeasurementWindow):
         elif self._searched is not None:
             before_s -= SEARCH_S
             self._searched = self._searched.select(self._searched.time_s >= before_s)
-        if self._samples is not None:
-            # A trajectory that is lost still predicts.
-            from_s = before_s if self._predictor is None else min(before_s, self._predictor.time_s)
-            first = int(self._samples.end_s.searchsorted(from_s - SAMPLES_MARGIN_S))
-            # The last one, however old: missing ones are filled in from there.
-            self._samples = self._samples.select(slice(max(min(first, len(self._samples) - 1), 0), None))
-            if self._odometry is not None:
-                driven = self._odometry.samples
-                driven = driven.select(driven.end_s > from_s - SAMPLES_MARGIN_S)
-                self._odometry = replace(self._odometry, samples=driven)
+        # A trajectory that is lost still predicts.
+        self._held.discard_before(
+            before_s if self._predictor is None else min(before_s, self._predictor.time_s)
+        )
 
     def predict(self, time_s: float, *, dim: int = POSE_DIM) -> tuple[States, FloatArray]:
         """Return the state at a time, given all so far, and the (1, 6, 6) covariance of its pose.
@@ -271,8 +231,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def _predict(self, time_s: float, dim: int) -> tuple[States, FloatArray]:
         assert self._predictor is not None  # noqa: S101 (only called while initialised)
-        assert self._samples is not None  # noqa: S101 (initialised)
-        state, covariance = self._predictor.at(time_s, self._samples, self._odometry)
+        state, covariance = self._predictor.at(time_s, self._held.imu, self._held.odometry)
         return state, covariance[:, :dim, :dim] * self._prediction_scale()
 
     def trajectory(self) -> WindowTrajectory:
@@ -315,13 +274,12 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def _predicted_common(self, time_s: float, dim: int) -> FloatArray:
         assert self._predictor is not None  # noqa: S101 (only called while initialised)
-        assert self._samples is not None  # noqa: S101 (initialised)
         displacement = self._window_displacement()
         assert displacement is not None  # noqa: S101 (only called where the set-up is uncertain)
         newest = np.concatenate([displacement[0][-1], displacement[1]])
-        displaced = self._predictor.by_start(time_s, self._samples, self._odometry) @ newest
+        displaced = self._predictor.by_start(time_s, self._held.imu, self._held.odometry) @ newest
         if self._mounting_factor is not None:
-            state, _ = self._predictor.at(time_s, self._samples, self._odometry)
+            state, _ = self._predictor.at(time_s, self._held.imu, self._held.odometry)
             displaced += by_mounting(state, self._mounting)[0] @ self._mounting_factor
         displaced = displaced[:dim]
         covariance: FloatArray = (displaced @ displaced.T)[None]
@@ -340,15 +298,6 @@ class InertialFixedLagSmoother(MeasurementWindow):
     def _mounted(self, observations: Observations) -> Observations:
         return replace(observations, layout=self._mounting.in_imu(observations.layout))
 
-    def _contiguous(self, knots_s: FloatArray) -> ContiguousSamples:
-        """Return the samples from the first knot to the last; a knot alone needs some too."""
-        assert self._samples is not None  # noqa: S101 (there are knots)
-        start_s, end_s = float(knots_s[0]), float(knots_s[-1])
-        first, stop = self._samples.end_s.searchsorted((start_s, end_s))
-        # One more at each end: where the first one begins, and what comes after the last knot.
-        some = self._samples.select(slice(max(int(first) - 1, 0), int(stop) + 1))
-        return contiguous(some, self._noise, start_s=start_s, end_s=end_s)
-
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
         self._health.advance(float(new.time_s[-1]))
@@ -363,29 +312,29 @@ class InertialFixedLagSmoother(MeasurementWindow):
     def _initialise(self, observations: Observations) -> None:
         self._converged, self._newest_nis = False, 0.0
         self._monitor.reset(observations)
-        if self._samples is not None and len(self._samples):
+        if len(self._held.imu):
             self._keep_rotation(float(observations.time_s[-1]))
         self._discard_trajectory()
         self.residuals_m = np.full((len(observations), 3), np.nan)
-        if self._samples is None or not len(self._samples):
+        if not len(self._held.imu):
             raise GeometryError("no samples of the IMU")
         # Before the first sample nothing links the measurements.
-        begin_s = float(self._samples.end_s[0] - self._samples.duration_s[0])
+        begin_s = self._held.begin_s
         if observations.time_s[0] < begin_s:
             self._horizon_s = begin_s
             self._select(observations.time_s >= begin_s)
             observations = observations.select(observations.time_s >= begin_s)
         searched = observations if self._searched is None else self._searched
         searched = searched.select(searched.time_s >= begin_s)
-        found, consistent = self._search(searched)
+        found, consistent = self._search.find(self._mounted(searched), self._held)
         knots = found.knots
         prior = diffuse_inertial_prior(
-            knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only, self._odometry
+            knots.select(slice(0, 1)), found.gravity, self._noise, self._gyro_only, self._held.odometry
         )
         sigmas = np.diag(prior.information) ** -0.5
-        sigmas[:9] = _DIFFUSE_SIGMAS
+        sigmas[:9] = DIFFUSE_SIGMAS
         anchor = replace(prior, information=np.diag(sigmas**-2.0))
-        samples = self._contiguous(knots.time_s)
+        samples = self._held.contiguous(knots.time_s)
         self._window = KnotWindow(knots, found.factors, samples.at(knots.time_s), anchor, samples)
         # Without measurements before the horizon, which the start needed.
         held = searched.time_s >= self._horizon_s
@@ -401,7 +350,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
                 self._eliminate(searched, found.knot_index, first, ~held)
             self.residuals_m = self.residuals_m[-len(observations) :]
             self._monitor.set_start(float(observations.time_s[-1]))
-            self._next_search_s = -np.inf
+            self._search.restart()
             self._reliable_from_s = _measured_twice_s(observations.select(~outliers))
         else:
             self.residuals_m = np.full((len(observations), 3), np.nan)
@@ -440,32 +389,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def _carried(self, known: KnownRotation, time_s: float) -> KnownRotation:
         times_s = np.array([known.time_s, max(time_s, known.time_s)])
-        return known.carried(self._contiguous(times_s), float(times_s[1]), self._noise)
-
-    def _search(self, observations: Observations) -> tuple[InertialSolution, bool]:
-        """Find the trajectory of measurements without any prior knowledge, and whether they agree with it and with the samples."""
-        if len(observations) < MIN_MEASUREMENTS:
-            raise GeometryError("too few measurements")
-        newest_s = float(observations.time_s[-1])
-        if newest_s < self._next_search_s:
-            raise GeometryError("too little measured since the last search")
-        if len(np.unique(observations.prism)) == 1 and _path_m(observations) < MIN_PATH_M:
-            raise GeometryError("one prism alone tells the heading of a robot only in motion")
-        length_s = newest_s - float(observations.time_s[0])
-        self._next_search_s = newest_s + max(MIN_SEARCH_STEP_S, (SEARCH_GROWTH - 1.0) * length_s)
-        mounted = self._mounted(observations)
-        setup = InertialSetup(
-            self._contiguous(inertial_knot_times(observations.time_s)), self._noise, self._gyro_only
-        )
-        found = search_heading(mounted, setup, self._initial_gravity)
-        if not found.determined:
-            raise GeometryError("the measurements do not tell the heading of the robot")
-        start = found.solution
-        consistent = _is_consistent(start)
-        if self._odometry is not None:
-            setup = replace(setup, odometry=self._odometry)
-            return solve_inertial(mounted, setup, start.knots.with_wheels(), start.gravity), consistent
-        return solve_inertial(mounted, setup, start.knots, start.gravity, factors=start.factors), consistent
+        return known.carried(self._held.contiguous(times_s), float(times_s[1]), self._noise)
 
     def _update_tracked(self, held: Observations, new: Observations) -> bool:
         assert self._window is not None  # noqa: S101 (converged)
@@ -495,8 +419,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
             system.whitened[is_new], knot_index[is_new], system.gradient, solve_system
         )
         if self._health.innovations(observations.time_s[is_new], observations.prism[is_new], nis):
-            self._samples, self._searched, self._next_search_s = None, None, -np.inf
-            self._known = None
+            self._held.clear_imu()
+            self._search.restart()
+            self._searched = self._known = None
             return False
         weights = self._weigh(nis, sequential_nis)
         system.weights[is_new] = weights
@@ -522,7 +447,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         else:
             found = solve_inertial(
                 observations,
-                InertialSetup(window.samples, self._noise, self._gyro_only, self._odometry),
+                InertialSetup(window.samples, self._noise, self._gyro_only, self._held.odometry),
                 knots,
                 gravity,
                 anchor=window.anchor,
@@ -547,7 +472,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if added and times_s[-1] - old_s[-1] > MAX_KNOT_SPACING_S:
             newest = int(times_s.searchsorted(old_s[-1]))
             times_s = np.concatenate([times_s[:newest], divided(times_s[newest:])])
-        samples = self._contiguous(times_s)
+        samples = self._held.contiguous(times_s)
         # The states of the knots before; those of new ones are propagated below.
         nearest = old_s.searchsorted(times_s, side="right") - 1
         guess = replace(knots.select(nearest), time_s=times_s)
@@ -555,13 +480,13 @@ class InertialFixedLagSmoother(MeasurementWindow):
             guess,
             samples,
             self._noise,
-            stale_from_s=self._stale_from_s,
+            stale_from_s=self._held.stale_from_s,
             gyro_only=self._gyro_only,
-            odometry=self._odometry,
+            odometry=self._held.odometry,
         )
         for row in np.flatnonzero(old_s[nearest] != times_s).tolist():
             propagate(guess, row, factors, self._gravity, self._gyro_only)
-        self._stale_from_s = np.inf
+        self._held.stale_from_s = np.inf
         if factors.odometry is not None:
             factors = replace(factors, odometry=factors.odometry.with_slip(guess.wheels[:, 1]))
         return KnotWindow(guess, factors, samples.at(times_s), window.anchor, samples)
@@ -642,20 +567,6 @@ class InertialFixedLagSmoother(MeasurementWindow):
             window.kinematics[0][first],
         )
         self._window = replace(window.select(slice(first, None)), anchor=anchor)
-
-
-def _is_consistent(start: InertialSolution) -> bool:
-    """Whether measurements, samples and priors agree in a start, whose position, velocity and rotation are free."""
-    outliers = start.squared_distances >= OUTLIER_THRESHOLD**2
-    _, loss = robust_loss(start.squared_distances[outliers])
-    freedom = 3 * np.count_nonzero(~outliers) - len(_DIFFUSE_SIGMAS)
-    return start.cost - float(loss.sum()) < MAX_START_COST * float(freedom)
-
-
-def _path_m(observations: Observations) -> float:
-    """Largest distance of the measured points from the first."""
-    points = observations.in_world()
-    return float(np.linalg.norm(points - points[0], axis=1).max())
 
 
 def _measured_twice_s(observations: Observations) -> float:

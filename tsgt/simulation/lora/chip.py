@@ -1,7 +1,7 @@
 """A simulated SX1276 (RFM95, Dragino HAT) at register level: SPI bus, pins, modes.
 
 It exchanges bytes within an NSS window as the real chip does, so that drivers for real chips run unchanged
-(facts/radio.md 1 to 4 and 12). Not simulated: FSK transmission and reception, frequency hopping, the analogue side (LNA
+(docs/explanation/simulated-radio.md). Not simulated: FSK transmission and reception, frequency hopping, the analogue side (LNA
 gain, ramp, over-current trim and intermediate frequency have no effect), edges of DIO4 PllLock and DIO5 ModeReady
 (their levels are right), ClkOut.
 """
@@ -43,7 +43,7 @@ BOOT_NS = 5_000_000
 """From the end of a reset until the chip may be used (data sheet 7.2.2)."""
 
 # Flag on each DIO, by the two bits of its mapping (data sheet table 18). DIO0 with 11 is not documented;
-# programs in the field depend on it (facts/radio.md 2.3).
+# programs in the field depend on it.
 _FHSS = int(reg.Irq.FHSS_CHANGE_CHANNEL)
 _DIO_FLAGS = (
     (modem.RX_DONE, modem.TX_DONE, modem.CAD_DONE, modem.RX_DONE | modem.TX_DONE),
@@ -293,7 +293,7 @@ class SX1276Chip:
         return before
 
     def _write_op_mode(self, value: int) -> None:
-        """Change mode; LongRangeMode changes in SLEEP only (facts/radio.md 3.1)."""
+        """Change mode; LongRangeMode changes in SLEEP only (data sheet table 41, RegOpMode)."""
         old = self._memory.lora[Register.OP_MODE]
         lora_mode = (old if old & reg.MODE_MASK else value) & reg.LONG_RANGE_MODE
         new = lora_mode | value & (_LORA_MODE_BITS if lora_mode else _FSK_MODE_BITS)

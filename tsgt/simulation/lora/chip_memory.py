@@ -18,8 +18,7 @@ REG_IMAGE_CAL = 0x3B
 REGISTERS = 0x80
 """Number of addresses."""
 
-# Data sheet table 41 and section 6.4; reserved ones as found by drivers
-# (facts/radio.md 2.1, 2.2).
+# Data sheet table 41 and section 6.4; reserved ones as found by drivers.
 _COMMON_RESET = {
     Register.OP_MODE: 0x09,  # FSK, low-frequency registers, STDBY
     Register.FRF_MSB: 0x6C,  # 434 MHz

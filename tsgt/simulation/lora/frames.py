@@ -11,7 +11,7 @@ from tsgt.radio import HEADER_SYMBOLS, payload_symbols, symbol_time_ns
 
 @dataclass(frozen=True)
 class Modulation:
-    """What sender and receiver must share (facts/radio.md 3.3)."""
+    """What sender and receiver must share."""
 
     frequency_hz: float  # nominal carrier frequency
     spreading_factor: int  # 6 to 12

@@ -36,7 +36,7 @@ TX_DONE = int(reg.Irq.TX_DONE)
 CAD_DONE = int(reg.Irq.CAD_DONE)
 CAD_DETECTED = int(reg.Irq.CAD_DETECTED)
 
-# Low five bits of RegModemStat (facts/radio.md 2.2).
+# Low five bits of RegModemStat (data sheet table 41).
 _IDLE = reg.MODEM_CLEAR
 _SEARCHING = reg.RX_ON_GOING
 _LOCKED = _SEARCHING | reg.SIGNAL_DETECTED | reg.SIGNAL_SYNCHRONIZED
@@ -45,7 +45,9 @@ _HEADER_KNOWN = _LOCKED | reg.HEADER_INFO_VALID
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChipTiming:
-    """Processing times of the chip (facts/radio.md 3.3, 3.5, 7.1, 7.2).
+    """Processing times of the chip.
+
+    From the data sheet, but for the ends of frames: as measured by Semtech's LoRa Basics MAC, interpolated for other bandwidths.
 
     Attributes
     ----------

@@ -29,7 +29,7 @@ _NARROW_RX_OFFSET_HZ = {
     (41_700, 0x44): 41_670,
 }
 
-# RegPktSnrValue is signed, in quarters of a dB; real ones saturate (facts/radio.md 2.4).
+# RegPktSnrValue is signed, in quarters of a dB; real ones saturate.
 _MIN_SNR_QUARTERS = -128
 _MAX_SNR_QUARTERS = 56
 

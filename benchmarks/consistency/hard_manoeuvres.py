@@ -15,8 +15,8 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
-from harness.manoeuvre import speeding_up_and_turning_back
-from harness.prior_motion import measure, rows_at, sorted_by_time
+from harness.drives.manoeuvre import speeding_up_and_turning_back
+from harness.drives.prior_motion import measure, rows_at, sorted_by_time
 
 from tsgt.geometry.trajectory import FixedLagSmoother
 from tsgt.model import MotionPrior

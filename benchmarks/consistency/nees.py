@@ -20,8 +20,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
-from harness.scene import stationary_scene
+from harness.drives.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
+from harness.drives.scene import stationary_scene
 from measuring import normalised_squared
 from scipy.stats import chi2
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from harness.prior_motion import draw_motions, measure, sorted_by_time
+from harness.drives.prior_motion import draw_motions, measure, sorted_by_time
 from instruments.instrument_time import Case, errors
 from measuring import normalised_squared
 

@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
+from harness.drives.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 from measuring import normalised_squared
 
 from tsgt.geometry.trajectory import FixedLagSmoother

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.imu_faults import Drive
+from harness.inertial.imu_faults import Drive
 
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging

@@ -16,8 +16,8 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from harness.imu_recording import imu_recording, shaken_drive, write
-from harness.records import START
+from harness.files.records import START
+from harness.inertial.imu_recording import imu_recording, shaken_drive, write
 
 from tsgt.analysis.evaluation import read_tum
 from tsgt.geometry import log_so3, rotation_from_quaternion

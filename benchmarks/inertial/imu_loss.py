@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.imu_faults import Drive, Poses
+from harness.inertial.imu_faults import Drive, Poses
 
 from tsgt.log import configure_logging
 from tsgt.simulation.faults import Fault, FaultKind, imu_conditions

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from harness.imu_faults import Drive, confirm_once
+from harness.inertial.imu_faults import Drive, confirm_once
 
 from tsgt.estimation import imu_setup_monitor
 from tsgt.log import configure_logging

@@ -10,11 +10,11 @@ import sys
 from typing import TYPE_CHECKING
 
 import structlog
-from harness.network_scripts import NetworkScript, all_network_scripts, run_network_script
+from harness.instruments.network_scripts import NetworkScript, all_network_scripts, run_network_script
 from measuring import Stopwatch
 
 if TYPE_CHECKING:
-    from harness.serial_scripts import ScriptResult
+    from harness.instruments.serial_scripts import ScriptResult
 
 
 def main() -> None:

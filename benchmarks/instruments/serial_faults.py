@@ -9,7 +9,7 @@ import logging
 import sys
 
 import structlog
-from harness.serial_scripts import Script, ScriptResult, all_scripts, run_script
+from harness.instruments.serial_scripts import Script, ScriptResult, all_scripts, run_script
 from measuring import Stopwatch
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from harness.kill_checks import check_files_after_kills
+from harness.missions.kill_checks import check_files_after_kills
 
 from missions.endurance_subscribers import Subscribers
 from missions.endurance_watch import (

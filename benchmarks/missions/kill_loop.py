@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.kill_checks import FileReport, check_files_after_kills
+from harness.missions.kill_checks import FileReport, check_files_after_kills
 
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig

@@ -8,7 +8,7 @@ from __future__ import annotations
 import errno
 from typing import TYPE_CHECKING
 
-from harness import defects_of_strangers as d
+from harness.missions import defects_of_strangers as d
 
 from missions.planted_defects import Defect, silent_station
 from tsgt.simulation.faults import FaultKind as F

@@ -31,8 +31,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 import pytest
-from harness import defects, defects_published
-from harness.defects import Planting
+from harness.missions import defects, defects_published
+from harness.missions.defects import Planting
 
 from tsgt.config import ClassicMasterConfig, ScenarioConfig, SuperframeMasterConfig
 from tsgt.log import configure_logging

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from harness.passed_on import PassedOn
+from harness.missions.passed_on import PassedOn
 from measuring import normalised_squared
 
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig

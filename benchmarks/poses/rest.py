@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.prior_motion import CENTRE_M
-from harness.scene import FRAMES
-from harness.slow_motion import LINE_OF_SIGHT, creeping, measure_along
+from harness.drives.prior_motion import CENTRE_M
+from harness.drives.scene import FRAMES
+from harness.drives.slow_motion import LINE_OF_SIGHT, creeping, measure_along
 from measuring import normalised_squared
 
 from tsgt.analysis.evaluation import (

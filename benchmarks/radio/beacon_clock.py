@@ -16,7 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
+from harness.clocks.beacon_scenarios import BEACON_SCENARIOS, run_beacon_scenario
 from measuring import best_s
 
 from tsgt.radio.superframe import SESSION_INTERVAL
@@ -25,7 +25,7 @@ from tsgt.radio.superframe.station_state import FULL_TIME_FRAMES
 from tsgt.timesync import BeaconClock
 
 if TYPE_CHECKING:
-    from harness.beacon_scenarios import BeaconScenario, ReportedTime
+    from harness.clocks.beacon_scenarios import BeaconScenario, ReportedTime
 
 EARLY = 12
 """Some of so many first beacons share a delay, drawn between these two."""

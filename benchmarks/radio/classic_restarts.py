@@ -14,8 +14,8 @@ import sys
 from functools import partial
 from random import Random
 
-from harness.radios import MS
-from harness.single_station import SECOND, single_station
+from harness.hardware.radios import MS
+from harness.radio.single_station import SECOND, single_station
 
 from tsgt.simulation.kernel import run_virtual
 

@@ -11,11 +11,11 @@ import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from harness.clock_scenarios import SCENARIOS, run_clock_scenario
+from harness.clocks.clock_scenarios import SCENARIOS, run_clock_scenario
 from measuring import Stopwatch
 
 if TYPE_CHECKING:
-    from harness.clock_scenarios import ClockOutcome
+    from harness.clocks.clock_scenarios import ClockOutcome
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Forged packets against the cores of a master and three stations: how many of each kind, and how many had an effect.
 
-Those of an exchange that is under way, at the worst moment, without a radio in between; see ``harness.forgery``.
+Those of an exchange that is under way, at the worst moment, without a radio in between; see ``harness.radio.forgery``.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import argparse
 import time
 
 import numpy as np
-from harness.forgery import KINDS, forge
+from harness.radio.forgery import KINDS, forge
 
 from tsgt.radio import LoRaSettings
 from tsgt.radio.superframe import FrameTiming

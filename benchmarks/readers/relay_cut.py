@@ -10,8 +10,8 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
-from harness.cable_cut import cut_cable
-from harness.network import missing
+from harness.readers.cable_cut import cut_cable
+from harness.readers.network import missing
 
 
 def main() -> str | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.ros2 import DISTRIBUTIONS, RosSystem, drive, environment
+from harness.readers.ros2 import DISTRIBUTIONS, RosSystem, drive, environment
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

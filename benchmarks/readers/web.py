@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import aiohttp
-from harness.browser import CHROMIUM, browser
-from harness.foxglove import app
+from harness.readers.browser import CHROMIUM, browser
+from harness.readers.foxglove import app
 
 from tsgt.master.stream_server import StreamServer
 from tsgt.recording import HelloRecord, encode_line

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from harness.browser import CHROMIUM, browser
+from harness.readers.browser import CHROMIUM, browser
 
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
@@ -34,7 +34,7 @@ from tsgt.web.stations import MAX_AGE_S
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
-    from harness.browser import Tab
+    from harness.readers.browser import Tab
 
 SIZES = ((1280, 800), (800, 1280), (390, 844))
 SCHEMES = ("light", "dark")

@@ -11,7 +11,7 @@ import asyncio
 import sys
 from pathlib import Path
 
-from harness.browser import CHROMIUM, browser
+from harness.readers.browser import CHROMIUM, browser
 
 from tsgt.clock import SystemClock
 from tsgt.web.recorded import index_of

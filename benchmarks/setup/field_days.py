@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from harness.field_day import FAR_TARGETS, REQUIRED, START_NS, Cause, Kind, calibrated, field_day
+from harness.drives.field_day import FAR_TARGETS, REQUIRED, START_NS, Cause, Kind, calibrated, field_day
 from measuring import Stopwatch, normalised_squared
 
 from tsgt.analysis.diagnosis import HELD_OUT, diagnose
@@ -33,7 +33,7 @@ from tsgt.geometry import invert
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harness.field_day import FieldDay
+    from harness.drives.field_day import FieldDay
 
     from tsgt.analysis.diagnosis import Finding
     from tsgt.estimation import PoseBatch

@@ -15,7 +15,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from harness.target_field import TargetField, frame_nees
+from harness.instruments.target_field import TargetField, frame_nees
 from scipy.special import chdtri
 
 from tsgt.analysis.calibration import TargetCalibration, target_notes

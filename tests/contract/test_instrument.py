@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.bridge import ServedInstrument
-from harness.leica import leica_bench
+from harness.instruments.bridge import ServedInstrument
+from harness.instruments.leica import leica_bench
 
 from tsgt.config import BridgeInstrumentConfig
 from tsgt.errors import InstrumentError
@@ -20,7 +20,7 @@ from tsgt.station.bridge import BridgeInstrument
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
 
-    from harness.leica import LeicaBench
+    from harness.instruments.leica import LeicaBench
 
     from tsgt.station import Instrument
 

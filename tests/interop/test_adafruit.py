@@ -6,14 +6,19 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.blocking import ACCESS_S
-from harness.lab import SIZES, lab, payload
-from harness.peripherals import CircuitPythonPin, CircuitPythonSpi, circuit_python_modules, import_driver
+from harness.hardware.blocking import ACCESS_S
+from harness.hardware.lab import SIZES, lab, payload
+from harness.hardware.peripherals import (
+    CircuitPythonPin,
+    CircuitPythonSpi,
+    circuit_python_modules,
+    import_driver,
+)
 
 from tsgt.radio import LoRaSettings
 
 if TYPE_CHECKING:
-    from harness.lab import Lab
+    from harness.hardware.lab import Lab
 
 HEADER = b"\xff\xff\x00\x00"
 """RadioHead's header before each payload: to, from, id, flags."""

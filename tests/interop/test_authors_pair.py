@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.authors_master import AuthorsMaster
-from harness.radios import MS, running_timeline
-from harness.scripted_instrument import READING, ScriptedInstrument
+from harness.hardware.radios import MS, running_timeline
+from harness.instruments.scripted_instrument import READING, ScriptedInstrument
+from harness.radio.authors_master import AuthorsMaster
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import InstrumentError

@@ -6,13 +6,13 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.cpp_node import CppNode
-from harness.lab import lab, payload
+from harness.hardware.cpp_node import CppNode
+from harness.hardware.lab import lab, payload
 
 from tsgt.radio import LoRaSettings
 
 if TYPE_CHECKING:
-    from harness.lab import Lab
+    from harness.hardware.lab import Lab
 
 MEASUREMENT_BYTES = 34
 spreading_factors = pytest.mark.parametrize("spreading_factor", [8, 9])

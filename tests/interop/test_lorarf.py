@@ -6,13 +6,13 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.lab import SIZES, lab, payload
-from harness.peripherals import RaspberryPi, import_driver
+from harness.hardware.lab import SIZES, lab, payload
+from harness.hardware.peripherals import RaspberryPi, import_driver
 
 from tsgt.radio import LoRaSettings
 
 if TYPE_CHECKING:
-    from harness.lab import Lab
+    from harness.hardware.lab import Lab
 
 POLLING, WITH_DIO0 = -1, 4
 RESET_PIN = 17

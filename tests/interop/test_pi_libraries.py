@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness.pi import LINE, FakePi, FakeRpiGpio
+from harness.hardware.pi import LINE, FakePi, FakeRpiGpio
 
 from tsgt.radio.sx127x import hal
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.records import PARAMETERS, STATUS
-from harness.ros2 import DISTRIBUTIONS, RosSystem, drive, environment
+from harness.files.records import PARAMETERS, STATUS
+from harness.readers.ros2 import DISTRIBUTIONS, RosSystem, drive, environment
 
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.recording import PoseRecord, StationStatus

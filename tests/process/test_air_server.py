@@ -8,7 +8,7 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from harness.processes import ROOT, TIMEOUT_S
+from harness.missions.processes import ROOT, TIMEOUT_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.processes import TIMEOUT_S
-from harness.records import EVENT
+from harness.files.records import EVENT
+from harness.missions.processes import TIMEOUT_S
 from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock

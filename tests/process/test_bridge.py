@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.processes import TIMEOUT_S
+from harness.missions.processes import TIMEOUT_S
 from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.processes import ROOT, TIMEOUT_S, wait_for
+from harness.missions.processes import ROOT, TIMEOUT_S, wait_for
 
 from tsgt.recording.journal import load_journal
 

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.processes import ROOT, TIMEOUT_S
+from harness.missions.processes import ROOT, TIMEOUT_S
 
 from tsgt.analysis.formats import read_partial_target_file
 from tsgt.radio.key_file import write_key

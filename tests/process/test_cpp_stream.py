@@ -11,10 +11,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.network import PERIOD_NS, TSGT, Master
-from harness.processes import ROOT, TIMEOUT_S, Program, free_port
-from harness.records import EVENT, HELLO, NO_POSE, POSE, SETUP
-from harness.stream_lines import lines, serving
+from harness.files.records import EVENT, HELLO, NO_POSE, POSE, SETUP
+from harness.files.stream_lines import lines, serving
+from harness.missions.processes import ROOT, TIMEOUT_S, Program, free_port
+from harness.readers.network import PERIOD_NS, TSGT, Master
 
 from tsgt.radio.key_file import write_key
 from tsgt.recording import encode_line

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from harness.processes import TIMEOUT_S
+from harness.missions.processes import TIMEOUT_S
 
 from tsgt.model import PolarMeasurement
 from tsgt.recording import load_recording

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from harness.fake_machine import CLIENT
+from harness.hardware.fake_machine import CLIENT
 
 from tsgt.config import ScenarioConfig
 from tsgt.simulation.instrument import PtyLine, SimulatedTotalStation

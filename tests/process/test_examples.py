@@ -7,9 +7,9 @@ import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from harness.processes import ROOT, TIMEOUT_S, Program
-from harness.records import EVENT, HELLO, NO_POSE, POSE, SETUP, measurement
-from harness.stream_lines import lines, serving
+from harness.files.records import EVENT, HELLO, NO_POSE, POSE, SETUP, measurement
+from harness.files.stream_lines import lines, serving
+from harness.missions.processes import ROOT, TIMEOUT_S, Program
 
 if TYPE_CHECKING:
     from pathlib import Path

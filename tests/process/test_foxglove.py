@@ -9,15 +9,15 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.records import EVENT
-from harness.scripted_mission import scripted_mission
-from harness.web import in_real_time
+from harness.files.records import EVENT
+from harness.missions.scripted_mission import scripted_mission
+from harness.readers.web import in_real_time
 
 from tsgt.recording import encode_line
 
 pytest.importorskip("foxglove", reason="the extra foxglove is not installed (pip install 'tsgt[foxglove]')")
 
-from harness.foxglove import app
+from harness.readers.foxglove import app
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

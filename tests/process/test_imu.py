@@ -9,8 +9,8 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.imu_devices import PtyDevice, SimulatedVectorNav, SimulatedXsens
-from harness.processes import TIMEOUT_S
+from harness.inertial.imu_devices import PtyDevice, SimulatedVectorNav, SimulatedXsens
+from harness.missions.processes import TIMEOUT_S
 from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock, UnixTimeline
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from harness.imu_devices import Motion, SimulatedDevice
+    from harness.inertial.imu_devices import Motion, SimulatedDevice
 
     from tsgt.model import ImuSamples
 

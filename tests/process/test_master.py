@@ -12,7 +12,7 @@ import sys
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.processes import ROOT, TIMEOUT_S, wait_for
+from harness.missions.processes import ROOT, TIMEOUT_S, wait_for
 
 from tsgt.master.reload import RELOAD_SIGNAL
 from tsgt.radio.key_file import write_key

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import HEADER, PARAMETERS, measurement
+from harness.files.records import HEADER, PARAMETERS, measurement
 
 from tsgt.recording import RecordingWriter, load_recording, read_lines
 
@@ -25,7 +25,7 @@ KILLS = 8
 WRITE_FOR_EVER = """
 import itertools, sys
 from pathlib import Path
-from harness.records import HEADER, PARAMETERS, measurement
+from harness.files.records import HEADER, PARAMETERS, measurement
 from tsgt.recording import RecordingWriter
 
 with RecordingWriter(Path(sys.argv[1])) as writer:

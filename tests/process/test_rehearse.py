@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from harness.processes import ROOT
+from harness.missions.processes import ROOT
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ import sys
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.cable_cut import cut_cable
-from harness.network import FOLLOW, ROBOT_ADDRESS, TSGT, Master, missing, network
+from harness.readers.cable_cut import cut_cable
+from harness.readers.network import FOLLOW, ROBOT_ADDRESS, TSGT, Master, missing, network
 
 from tsgt.radio.key_file import write_key
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.network import TSGT, Master
-from harness.processes import TIMEOUT_S, Program, free_port
+from harness.missions.processes import TIMEOUT_S, Program, free_port
+from harness.readers.network import TSGT, Master
 
 from tsgt.client import Pose, Stream
 from tsgt.radio.key_file import write_key

@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from harness.processes import ROOT, TIMEOUT_S
+from harness.missions.processes import ROOT, TIMEOUT_S
 
 PROGRAM = """
 import asyncio

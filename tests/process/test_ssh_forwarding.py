@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from harness.network import (
+from harness.readers.network import (
     FOLLOW,
     PERIOD_NS,
     ROBOT_ADDRESS,

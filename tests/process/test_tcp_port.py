@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.leica import leica_config
+from harness.instruments.leica import leica_config
 
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig, TcpAddress

@@ -19,8 +19,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from harness.processes import TIMEOUT_S
-from harness.records import EVENT, HELLO, POSE, STATUS, measurement
+from harness.files.records import EVENT, HELLO, POSE, STATUS, measurement
+from harness.missions.processes import TIMEOUT_S
 
 from tsgt.model import Status
 from tsgt.recording import StationStatus, encode_line

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.browser import CHROMIUM, Tab, browser
-from harness.records import EVENT, HEADER, PARAMETERS
-from harness.scripted_mission import scripted_mission
-from harness.web import in_real_time, pose, status
+from harness.files.records import EVENT, HEADER, PARAMETERS
+from harness.missions.scripted_mission import scripted_mission
+from harness.readers.browser import CHROMIUM, Tab, browser
+from harness.readers.web import in_real_time, pose, status
 
 from tsgt.model import Status
 from tsgt.recording import encode_line

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from harness.air import RecordingListener, frame, modulation
+from harness.radio.air import RecordingListener, frame, modulation
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from harness.beacon_scenarios import BeaconScenario, run_beacon_scenario
+from harness.clocks.beacon_scenarios import BeaconScenario, run_beacon_scenario
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

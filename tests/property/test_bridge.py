@@ -8,8 +8,8 @@ from collections import deque
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from harness.bridge import HELLO, measured
-from harness.damage import Damage, damages, examples
+from harness.files.damage import Damage, damages, examples
+from harness.instruments.bridge import HELLO, measured
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs

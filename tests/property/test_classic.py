@@ -6,8 +6,8 @@ import math
 from typing import cast, get_args
 
 import pytest
-from harness.damage import examples
-from harness.radios import MS, PAPER
+from harness.files.damage import examples
+from harness.hardware.radios import MS, PAPER
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from harness.records import HELLO, POSE, SETUP, STATUS
+from harness.files.records import HELLO, POSE, SETUP, STATUS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

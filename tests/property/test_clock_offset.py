@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from harness.clock_exchanges import SECOND, START_NS, exchange
+from harness.clocks.clock_exchanges import SECOND, START_NS, exchange
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

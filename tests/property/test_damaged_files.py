@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
-from harness.cli import called
-from harness.cli_contract import Files, check_command
-from harness.damage import UNDAMAGED, Damage, Samples, damages, examples
-from harness.pos_files import SECOND, write_pos
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.files.cli import called
+from harness.files.cli_contract import Files, check_command
+from harness.files.damage import UNDAMAGED, Damage, Samples, damages, examples
+from harness.files.pos_files import SECOND, write_pos
 from hypothesis import example, given
 from hypothesis import strategies as st
 

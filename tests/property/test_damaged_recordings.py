@@ -6,12 +6,12 @@ import json
 from collections import Counter
 
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
-from harness.cli import called
-from harness.cli_contract import Files, check_command
-from harness.damage import UNDAMAGED, Damage, Samples, damages, examples
-from harness.merging import journals, recording
-from harness.missions import QUICK, SUPERFRAME, run_mission
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.files.cli import called
+from harness.files.cli_contract import Files, check_command
+from harness.files.damage import UNDAMAGED, Damage, Samples, damages, examples
+from harness.missions.merging import journals, recording
+from harness.missions.missions import QUICK, SUPERFRAME, run_mission
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 

@@ -7,8 +7,8 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from harness.damage import Damage, damages, examples
-from harness.leica import LeicaBench, leica_bench, leica_config
+from harness.files.damage import Damage, damages, examples
+from harness.instruments.leica import LeicaBench, leica_bench, leica_config
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs

@@ -7,9 +7,9 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
-from harness.forgery import KINDS, forge, state
-from harness.scripted_stations import KEY, TIMING
-from harness.superframe_loop import SuperframeLoop
+from harness.radio.forgery import KINDS, forge, state
+from harness.radio.scripted_stations import KEY, TIMING
+from harness.radio.superframe_loop import SuperframeLoop
 
 from tsgt.errors import MessageError
 from tsgt.model import Status

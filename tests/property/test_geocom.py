@@ -7,8 +7,8 @@ import itertools
 import re
 
 import pytest
-from harness.damage import examples
-from harness.geocom_line import (
+from harness.files.damage import examples
+from harness.instruments.geocom_line import (
     REQUEST,
     Cable,
     FakeInstrument,

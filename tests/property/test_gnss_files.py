@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from harness.pos_files import SECOND, Variant, write_pos
+from harness.files.pos_files import SECOND, Variant, write_pos
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.damage import Damage, damages, examples
-from harness.missions import QUICK, SUPERFRAME, run_mission
-from harness.scripted_stations import KEY, TIMING, counted
-from harness.superframe_loop import SuperframeLoop
+from harness.files.damage import Damage, damages, examples
+from harness.missions.missions import QUICK, SUPERFRAME, run_mission
+from harness.radio.scripted_stations import KEY, TIMING, counted
+from harness.radio.superframe_loop import SuperframeLoop
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.air import RecordingListener, frame
-from harness.cli import called
-from harness.client import client_config
-from harness.damage import Damage, damages, examples
-from harness.radios import PAPER, running_timeline
-from harness.records import CLOCK, EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
-from harness.scripted_instrument import ScriptedInstrument
-from harness.stream_lines import lines, serving
+from harness.files.cli import called
+from harness.files.damage import Damage, damages, examples
+from harness.files.records import CLOCK, EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
+from harness.files.stream_lines import lines, serving
+from harness.hardware.radios import PAPER, running_timeline
+from harness.instruments.scripted_instrument import ScriptedInstrument
+from harness.radio.air import RecordingListener, frame
+from harness.radio.client import client_config
 from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs

@@ -7,8 +7,8 @@ import math
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any
 
-from harness.damage import Damage, damages, examples
-from harness.imu import HELLO, samples
+from harness.files.damage import Damage, damages, examples
+from harness.inertial.imu import HELLO, samples
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -6,8 +6,8 @@ import time
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.pos_files import Variant
-from harness.records import POSE, STATUS, measurement, recording_bytes
+from harness.files.pos_files import Variant
+from harness.files.records import POSE, STATUS, measurement, recording_bytes
 
 from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import read_pos, read_stationary_intervals, read_target_file

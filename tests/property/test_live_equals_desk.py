@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import hypothesis.strategies as st
 import pytest
-from harness.records import CLOCK, EVENT, HEADER, STATUS
-from harness.scene import START, driving, stationary_scene
+from harness.drives.scene import START, driving, stationary_scene
+from harness.files.records import CLOCK, EVENT, HEADER, STATUS
 from hypothesis import given, settings
 
 from tsgt.config import GeofenceConfig
@@ -27,7 +27,7 @@ from tsgt.recording import SetupRecord, encode_line
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from harness.scene import Scene
+    from harness.drives.scene import Scene
 
     from tsgt.model import Measurement, PolarMeasurement
     from tsgt.recording import ClockRecord, EventRecord, PoseRecord, StatusRecord

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from harness.pose_files import Poses, odometry, write_bag
+from harness.files.pose_files import Poses, odometry, write_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from harness.chips import Bench
-from harness.damage import examples
-from harness.radios import PAPER, make_side, running_timeline
+from harness.files.damage import examples
+from harness.hardware.chips import Bench
+from harness.hardware.radios import PAPER, make_side, running_timeline
 from hypothesis import given
 from hypothesis import strategies as st
 

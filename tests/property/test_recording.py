@@ -5,8 +5,8 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from harness.damage import examples
-from harness.records import HEADER, PARAMETERS, POINT, POSE, STATUS, measurement, recording_bytes
+from harness.files.damage import examples
+from harness.files.records import HEADER, PARAMETERS, POINT, POSE, STATUS, measurement, recording_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from harness.damage import examples
+from harness.files.damage import examples
 from hypothesis import given
 from hypothesis import strategies as st
 

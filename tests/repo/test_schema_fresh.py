@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from harness.records import (
+from harness.files.records import (
     CLOCK,
     EVENT,
     HEADER,

@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-from harness.cli import tsgt  # noqa: F401 (a fixture)
+from harness.files.cli import tsgt  # noqa: F401 (a fixture)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from harness.scene import START, Motion, stationary_scene
+from harness.drives.scene import START, Motion, stationary_scene
 
 from tsgt.analysis.processing import process, with_estimator
 from tsgt.analysis.smoothing import smooth_recording

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.pos_files import SECOND, Variant, write_pos
+from harness.files.pos_files import SECOND, Variant, write_pos
 
 from tsgt.analysis.figures import draw_gnss
 from tsgt.analysis.formats import PosFile, read_pos

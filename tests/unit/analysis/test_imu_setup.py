@@ -6,14 +6,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.imu_calibration import (
+from harness.inertial.imu_calibration import (
     calibrated_imu,
     imu_records,
     parameters_of,
     point_measurements,
     uncalibrated_drive,
 )
-from harness.imu_recording import imu_recording, shaken_drive
+from harness.inertial.imu_recording import imu_recording, shaken_drive
 
 from tsgt.analysis.imu_setup import wrong_imu_setup
 from tsgt.analysis.smoothing import smooth_recording

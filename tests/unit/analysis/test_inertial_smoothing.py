@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.imu_recording import IMU, imu_recording, shaken_drive, true_positions_m
-from harness.records import START
+from harness.files.records import START
+from harness.inertial.imu_recording import IMU, imu_recording, shaken_drive, true_positions_m
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.smoothing import smooth_recording

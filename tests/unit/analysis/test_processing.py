@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import START, driving, stationary_scene
+from harness.drives.scene import START, driving, stationary_scene
 
 from tsgt.analysis.processing import has_raw_angles, process
 from tsgt.analysis.setup_replacement import with_calibration, with_layout

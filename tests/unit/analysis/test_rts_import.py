@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.authors_files import TARGET_CONSTANT_M, write_targets, write_tracks
-from harness.scene import FRAMES
+from harness.drives.scene import FRAMES
+from harness.files.authors_files import TARGET_CONSTANT_M, write_targets, write_tracks
 
 from tsgt.analysis.formats.rts_files import PublishedTrack, read_track
 from tsgt.analysis.rts_import import point_measurements, polar_measurements, stations_from_targets

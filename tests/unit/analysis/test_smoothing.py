@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, Motion, stationary_scene, with_origin
+from harness.drives.scene import LAYOUT, SECOND, START, Motion, stationary_scene, with_origin
 
 from tsgt.analysis.evaluation import held_out_errors
 from tsgt.analysis.evaluation.held_out import FOLDS

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
-from harness.cli import called
-from harness.cli_contract import Files, check_command
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.files.cli import called
+from harness.files.cli_contract import Files, check_command
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 ROOT = Path(__file__).parents[3]
 CONFIGS = ROOT / "configs"

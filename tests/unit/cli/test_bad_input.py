@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
-from harness.scene import LAYOUT
+from harness.drives.scene import LAYOUT
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
     from numpy.typing import NDArray
 
 TRACK_EDITS: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {

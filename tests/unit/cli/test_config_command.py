@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.cli import tsgt  # noqa: F401 (a fixture)
+from harness.files.cli import tsgt  # noqa: F401 (a fixture)
 
 from tsgt.config import KINDS, json_schema
 
 if TYPE_CHECKING:
-    from harness.cli import Outcome, Tsgt
+    from harness.files.cli import Outcome, Tsgt
 
 EXAMPLES = Path(__file__).parents[3] / "configs"
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from click.testing import CliRunner
-from harness.fake_machine import FakeMachine
+from harness.hardware.fake_machine import FakeMachine
 
 from tsgt.cli.daemons import client, master
 from tsgt.errors import ConfigError

@@ -7,7 +7,7 @@ import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.fake_machine import ADAPTER, FakeMachine
+from harness.hardware.fake_machine import ADAPTER, FakeMachine
 
 from tsgt.cli import doctor
 from tsgt.cli.doctor import this_machine
@@ -15,7 +15,7 @@ from tsgt.cli.doctor import this_machine
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 @pytest.fixture

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.authors_files import write_prisms, write_tracks
+from harness.files.authors_files import write_prisms, write_tracks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 LIDAR = "lidar=0.8,-0.3,-1.2,0.1,-0.2,0.3,0.9273618495495704"
 

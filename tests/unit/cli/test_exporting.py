@@ -8,7 +8,16 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.records import EVENT, HEADER, NO_POSE, PARAMETERS, POSE, START, measurement, recording_bytes
+from harness.files.records import (
+    EVENT,
+    HEADER,
+    NO_POSE,
+    PARAMETERS,
+    POSE,
+    START,
+    measurement,
+    recording_bytes,
+)
 from rosbags.highlevel import AnyReader
 
 from tsgt.model import ReferencePoint
@@ -17,7 +26,7 @@ from tsgt.recording import encode_line
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Outcome, Tsgt
+    from harness.files.cli import Outcome, Tsgt
 
     from tsgt.recording import Kind, PoseRecord
 

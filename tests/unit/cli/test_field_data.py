@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from harness.authors_files import CONSTANTS
+from harness.files.authors_files import CONSTANTS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 class Expected(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from harness.cli import called
+from harness.files.cli import called
 
 from tsgt.recording import read_odometry
 

@@ -6,14 +6,14 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 @pytest.fixture

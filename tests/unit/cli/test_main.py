@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 import pytest
-from harness.records import POSE, recording_bytes
+from harness.files.records import POSE, recording_bytes
 
 from tsgt.cli.main import COMMANDS, GROUPS, HELP_OPTIONS, cli, run
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 def groups() -> Iterator[tuple[str, click.Group]]:

@@ -6,13 +6,13 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.merging import journals, recording
-from harness.missions import run_mission
+from harness.missions.merging import journals, recording
+from harness.missions.missions import run_mission
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
     from tsgt.simulation.mission import MissionResult
 

@@ -10,7 +10,7 @@ import pytest
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 def test_key_is_made_for_its_owner_alone(tsgt: Tsgt, tmp_path: Path) -> None:

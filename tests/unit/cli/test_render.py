@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.records import (
+from harness.files.records import (
     CLOCK,
     EVENT,
     IMU_STATUS,

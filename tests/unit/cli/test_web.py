@@ -6,7 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.cli import called
+from harness.files.cli import called
 
 from tsgt.errors import ConfigError
 from tsgt.web.code_file import read_code

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.records import PARAMETERS, START
+from harness.files.records import PARAMETERS, START
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness.records import EVENT, HELLO, IMU_STATUS, NO_POSE, ODOMETRY_STATUS, POSE, SETUP, STATUS
+from harness.files.records import EVENT, HELLO, IMU_STATUS, NO_POSE, ODOMETRY_STATUS, POSE, SETUP, STATUS
 
 from tsgt.client import PROTOCOL_VERSION, Pose, records
 from tsgt.client.build import TYPES, build, load

@@ -7,7 +7,7 @@ import hmac
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import HELLO, STATUS
+from harness.files.records import HELLO, STATUS
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -10,8 +10,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import EVENT, HELLO, NO_POSE, POSE, STATUS, measurement
-from harness.stream_lines import lines, serving
+from harness.files.records import EVENT, HELLO, NO_POSE, POSE, STATUS, measurement
+from harness.files.stream_lines import lines, serving
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.fake_machine import FakeMachine
+from harness.hardware.fake_machine import FakeMachine
 
 from tsgt.doctor import Outcome, current_user, find_user, group_name, run_command
 from tsgt.doctor.machine import User

@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.fake_machine import NOW_NS, FakeMachine
+from harness.hardware.fake_machine import NOW_NS, FakeMachine
 
 from tsgt.doctor import Outcome
 from tsgt.doctor.machine import User

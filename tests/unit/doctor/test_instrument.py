@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.fake_machine import NOW_NS, FakeMachine
-from harness.radios import running_timeline
+from harness.hardware.fake_machine import NOW_NS, FakeMachine
+from harness.hardware.radios import running_timeline
 
 from tsgt.config import LeicaInstrumentConfig, ScenarioConfig
 from tsgt.doctor import Outcome

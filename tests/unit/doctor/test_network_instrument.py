@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.fake_machine import ADAPTER, FakeMachine
-from harness.radios import running_timeline
+from harness.hardware.fake_machine import ADAPTER, FakeMachine
+from harness.hardware.radios import running_timeline
 
 from tsgt.config import ScenarioConfig
 from tsgt.doctor import Outcome

@@ -6,9 +6,9 @@ import asyncio
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from harness import imu
-from harness.bridge import FakeStart
-from harness.fake_machine import NOW_NS, FakeMachine
+from harness.hardware.fake_machine import NOW_NS, FakeMachine
+from harness.inertial import imu
+from harness.instruments.bridge import FakeStart
 from structlog.testing import capture_logs
 
 from tsgt.doctor import Outcome

@@ -6,7 +6,7 @@ import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.fake_machine import FakeMachine
+from harness.hardware.fake_machine import FakeMachine
 
 from tsgt.doctor import Outcome, reach_server
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from harness.fake_machine import FakeMachine
+from harness.hardware.fake_machine import FakeMachine
 
 from tsgt.doctor import Outcome
 from tsgt.doctor.machine import User

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.fake_machine import ADAPTER, FakeMachine
+from harness.hardware.fake_machine import ADAPTER, FakeMachine
 
 from tsgt.doctor import Outcome
 from tsgt.doctor.machine import User

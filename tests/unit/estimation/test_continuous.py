@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, Scene, at_rest, driving, stationary_scene, with_origin
+from harness.drives.scene import SECOND, START, Scene, at_rest, driving, stationary_scene, with_origin
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import Kind, PoseBatch, Reason

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.imu_calibration import (
+from harness.files.records import SECOND, START
+from harness.inertial.imu_calibration import (
     calibrated_imu,
     imu_records,
     parameters_of,
     point_measurements,
     uncalibrated_drive,
 )
-from harness.records import SECOND, START
 
 from tsgt.errors import GeometryError
 from tsgt.estimation import ImuSetupMonitor, check_recorded_setup, imu_setup_monitor

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 import pytest
-from harness.records import IMU_PARAMETERS, imu_samples
-from harness.scene import SECOND, START, Scene, driving, stationary_scene
+from harness.drives.scene import SECOND, START, Scene, driving, stationary_scene
+from harness.files.records import IMU_PARAMETERS, imu_samples
 
 from tsgt.estimation import LiveEstimator, imu_setup_monitor
 from tsgt.estimation.continuous import ContinuousEstimator

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from harness.records import IMU_PARAMETERS, START, imu_samples
+from harness.files.records import IMU_PARAMETERS, START, imu_samples
 
 from tsgt.estimation import SampleConverter, inertial_samples
 from tsgt.geometry.inertial import InertialSamples, concatenate_samples

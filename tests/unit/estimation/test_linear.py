@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, at_rest, driving, stationary_scene
+from harness.drives.scene import LAYOUT, SECOND, START, at_rest, driving, stationary_scene
 
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import LinearEstimator, PoseBatch, Reason
@@ -17,7 +17,7 @@ from tsgt.model import TRACKING_NOISE, PrismPosition, Status
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from harness.scene import Motion, Scene
+    from harness.drives.scene import Motion, Scene
     from numpy.typing import NDArray
 
     from tsgt.model import PolarMeasurement

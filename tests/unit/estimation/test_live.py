@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from harness.scene import START, stationary_scene
+from harness.drives.scene import START, stationary_scene
 
 from tsgt.estimation import LiveEstimator
 from tsgt.model import PolarMeasurement

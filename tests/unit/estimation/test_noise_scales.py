@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from harness.scene import stationary_scene
+from harness.drives.scene import stationary_scene
 
 from tsgt.estimation import noise_scales, with_noise_scales
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.scene import START, Motion, stationary_scene
+from harness.drives.scene import START, Motion, stationary_scene
 
 from tsgt.estimation import build_observations, build_tracks
 from tsgt.estimation.observations import INSTRUMENT_TIME_SIGMA_S, MIN_SIGMA_M, centroid_m

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, at_rest, stationary_scene
+from harness.drives.scene import SECOND, START, at_rest, stationary_scene
 
 from tsgt.estimation import ContinuousPoseOutput, MeasurementHistory, Reason
 from tsgt.geometry import exp_so3

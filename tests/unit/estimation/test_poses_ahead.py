@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.prior_motion import draw_motions, measure, sorted_by_time
-from harness.scene import stationary_scene
+from harness.drives.prior_motion import draw_motions, measure, sorted_by_time
+from harness.drives.scene import stationary_scene
 
 from tsgt.estimation import ContinuousPoseOutput
 from tsgt.estimation.poses_ahead import EPOCHS, PosesAhead, SmoothedStatesAhead

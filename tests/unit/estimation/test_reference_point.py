@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, stationary_scene
+from harness.drives.scene import LAYOUT, stationary_scene
 
 from tsgt.estimation import (
     Kind,

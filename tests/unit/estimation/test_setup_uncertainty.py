@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from harness.records import IMU_PARAMETERS, PARAMETERS
+from harness.files.records import IMU_PARAMETERS, PARAMETERS
 
 from tsgt.estimation import InertialSetupUncertainty, uncertain_setup, with_setup
 from tsgt.model import SetupCovariance

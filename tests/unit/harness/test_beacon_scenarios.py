@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from harness.beacon_scenarios import BEACON_SCENARIOS, BeaconScenario, run_beacon_scenario
+from harness.clocks.beacon_scenarios import BEACON_SCENARIOS, BeaconScenario, run_beacon_scenario
 
 BY_NAME = {scenario.name: scenario for scenario in BEACON_SCENARIOS}
 CONVERGED_S = 5.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from harness.clock_scenarios import SCENARIOS, ClockScenario, Step, run_clock_scenario
+from harness.clocks.clock_scenarios import SCENARIOS, ClockScenario, Step, run_clock_scenario
 
 MS = 1e6
 BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.kill_checks import check_files_after_kills
-from harness.records import HEADER, PARAMETERS, measurement
+from harness.files.records import HEADER, PARAMETERS, measurement
+from harness.missions.kill_checks import check_files_after_kills
 
 from tsgt.radio.superframe.wire import RESTART_SKIP
 from tsgt.recording import encode_line
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from harness.kill_checks import FileReport
+    from harness.missions.kill_checks import FileReport
 
     from tsgt.model import PolarMeasurement
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.network_scripts import (
+from harness.instruments.network_scripts import (
     NetworkBench,
     NetworkScript,
     all_network_scripts,

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.serial_scripts import Bench, Script, all_scripts, run_script
+from harness.instruments.serial_scripts import Bench, Script, all_scripts, run_script
 
 from tsgt.simulation.instrument import LineFault
 

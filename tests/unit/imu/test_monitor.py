@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 import pytest
-from harness.imu import HELLO
+from harness.inertial.imu import HELLO
 
 from tsgt.imu.lines import HelloLine
 from tsgt.imu.monitor import ImuMonitor

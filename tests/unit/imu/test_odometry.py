@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 import pytest
-from harness.bridge import FakeStart
+from harness.instruments.bridge import FakeStart
 
 from tsgt.clock import UnixTimeline
 from tsgt.config import OdometryConfig

@@ -6,8 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.bridge import FakeStart
-from harness.imu import HELLO, samples
+from harness.inertial.imu import HELLO, samples
+from harness.instruments.bridge import FakeStart
 from structlog.testing import capture_logs
 
 from tsgt.clock import UnixTimeline
@@ -19,7 +19,7 @@ from tsgt.simulation.kernel import VirtualClock, run_virtual
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from harness.bridge import FakeProgram
+    from harness.instruments.bridge import FakeProgram
 
     from tsgt.model import ImuSamples
 

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.imu import HELLO, PERIOD_NS, samples
+from harness.inertial.imu import HELLO, PERIOD_NS, samples
 
 from tsgt.imu.lines import HelloLine, SamplesLine
 from tsgt.imu.sampler import Sampler

@@ -6,7 +6,7 @@ import math
 from itertools import pairwise
 
 import pytest
-from harness.imu_devices import SimulatedVectorNav
+from harness.inertial.imu_devices import SimulatedVectorNav
 from hypothesis import given
 from hypothesis import strategies as st
 

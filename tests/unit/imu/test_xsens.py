@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
-from harness.imu_devices import SimulatedXsens
+from harness.inertial.imu_devices import SimulatedXsens
 from hypothesis import given
 from hypothesis import strategies as st
 

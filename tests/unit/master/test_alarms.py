@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 import pytest
-from harness.records import EVENT
+from harness.files.records import EVENT
 from structlog.testing import capture_logs
 
 from tsgt.config import AlarmsConfig

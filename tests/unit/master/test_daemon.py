@@ -14,11 +14,11 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from harness import imu
-from harness.bridge import FakeStart
-from harness.field import DISK, STATIONS, TRUE, field_of, running
-from harness.radios import PAPER
-from harness.scene import START, driving, stationary_scene
+from harness.drives.scene import START, driving, stationary_scene
+from harness.hardware.radios import PAPER
+from harness.inertial import imu
+from harness.instruments.bridge import FakeStart
+from harness.missions.field import DISK, STATIONS, TRUE, field_of, running
 
 from tsgt.config import AlarmsConfig, GeofenceConfig, ImuConfig
 from tsgt.errors import ConfigError, RadioError
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
     from pathlib import Path
 
-    from harness.field import Field
+    from harness.missions.field import Field
 
     from tsgt.model import Parameters
     from tsgt.radio import Radio, Transmission

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.records import NO_POSE, POSE, SECOND, START
+from harness.files.records import NO_POSE, POSE, SECOND, START
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from harness.records import ODOMETRY_STATUS, POSE, SECOND, START, STATUS
+from harness.files.records import ODOMETRY_STATUS, POSE, SECOND, START, STATUS
 
 from tsgt.master.imu_monitor import AGREED_STATUSES, JUMP_INTERVAL_NS, ImuUseMonitor, OdometryUseMonitor
 

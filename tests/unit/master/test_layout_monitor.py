@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.arrivals import simulated_measurements
-from harness.records import NO_POSE, POSE, SECOND, START
+from harness.drives.arrivals import simulated_measurements
+from harness.files.records import NO_POSE, POSE, SECOND, START
 
 from tsgt.analysis.formats import read_prisms, read_tracks
 from tsgt.analysis.rts_import import point_measurements

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, driving, stationary_scene
+from harness.drives.scene import SECOND, START, driving, stationary_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +25,7 @@ from tsgt.simulation.world import scenario_world
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from harness.scene import Motion, Scene
+    from harness.drives.scene import Motion, Scene
     from numpy.typing import NDArray
 
     from tsgt.radio import Direction

@@ -6,8 +6,8 @@ import asyncio
 import errno
 from typing import TYPE_CHECKING
 
-from harness.field import running
-from harness.records import HEADER
+from harness.files.records import HEADER
+from harness.missions.field import running
 
 from tsgt.master.recording_thread import RecordingThread
 from tsgt.recording import RecordingWriter

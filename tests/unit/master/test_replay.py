@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.records import EVENT, HEADER, PARAMETERS, measurement, recording_bytes
-from harness.scene import START, stationary_scene
+from harness.drives.scene import START, stationary_scene
+from harness.files.records import EVENT, HEADER, PARAMETERS, measurement, recording_bytes
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import LiveEstimator
@@ -22,7 +22,7 @@ from tsgt.simulation.kernel import VirtualClock
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.scene import Scene
+    from harness.drives.scene import Scene
 
 SCENE = stationary_scene()
 FENCE = SetupGeofence(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from harness.records import SECOND, START, measurement
+from harness.files.records import SECOND, START, measurement
 
 from tsgt.master.station_events import StationEventDetector
 from tsgt.model import Status

@@ -3,7 +3,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 import pytest
-from harness.radios import PAPER
+from harness.hardware.radios import PAPER
 
 from tsgt.errors import RadioSettingsError
 from tsgt.radio import LoRaSettings

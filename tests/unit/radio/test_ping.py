@@ -5,7 +5,7 @@ from contextlib import aclosing, asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.plain_radio import AIRTIME_NS, PlainRadio
+from harness.radio.plain_radio import AIRTIME_NS, PlainRadio
 
 from tsgt.radio.ping import Exchange, Response, SignalStrength, ping, respond, summarise, summarise_responses
 from tsgt.simulation.kernel import VirtualClock

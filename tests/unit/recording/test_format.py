@@ -5,7 +5,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from harness.records import (
+from harness.files.records import (
     CLOCK,
     EVENT,
     HEADER,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import HEADER, PARAMETERS, measurement
+from harness.files.records import HEADER, PARAMETERS, measurement
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import Status

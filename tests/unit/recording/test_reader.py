@@ -4,7 +4,7 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import (
+from harness.files.records import (
     EVENT,
     HEADER,
     NO_POSE,

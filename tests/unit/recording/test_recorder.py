@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import HEADER
+from harness.files.records import HEADER
 from structlog.testing import capture_logs
 
 from tsgt.errors import RecordingError

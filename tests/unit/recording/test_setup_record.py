@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.records import PARAMETERS, SETUP
+from harness.files.records import PARAMETERS, SETUP
 from scipy.spatial.transform import Rotation
 
 from tsgt.model import PipelineParameters, SetupCovariance

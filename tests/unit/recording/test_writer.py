@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import HEADER, PARAMETERS, measurement, recording_bytes
+from harness.files.records import HEADER, PARAMETERS, measurement, recording_bytes
 
 from tsgt.errors import RecordingError, RecordingVersionError
 from tsgt.recording import RecordingWriter, encode_line, load_recording

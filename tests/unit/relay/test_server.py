@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import HELLO, POSE, SETUP
+from harness.files.records import HELLO, POSE, SETUP
 
 from tsgt.client import AsyncStream, AuthenticationError, Event, Gap, Hello, Pose, Setup, pump
 from tsgt.client.records import monotonic_ns

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.pi import FakePi
-from harness.radios import PAPER, running_timeline
+from harness.hardware.pi import FakePi
+from harness.hardware.radios import PAPER, running_timeline
 
 from tsgt.errors import RadioError
 from tsgt.radio.sx127x import hal, open_hal

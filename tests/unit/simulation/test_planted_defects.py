@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.defects import Planting
+from harness.missions.defects import Planting
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from harness.records import HEADER, measurement
+from harness.files.records import HEADER, measurement
 from structlog.testing import capture_logs
 
 from tsgt.radio.superframe import BeaconReception

@@ -8,9 +8,9 @@ from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.client import client_config
-from harness.radios import PAPER
-from harness.scripted_instrument import ScriptedInstrument
+from harness.hardware.radios import PAPER
+from harness.instruments.scripted_instrument import ScriptedInstrument
+from harness.radio.client import client_config
 
 from tsgt.errors import InstrumentRefusedError, RadioError, RecordingError
 from tsgt.recording import RecordingWriter, encode_line, read_lines

@@ -9,9 +9,9 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
-from harness.radios import PAPER
-from harness.scripted_instrument import ScriptedInstrument
+from harness.hardware.radios import PAPER
+from harness.instruments.scripted_instrument import ScriptedInstrument
+from harness.radio.client import OFFSET_NS, SCENARIO, START_NS, client_config, field_day
 from structlog.testing import capture_logs
 
 from tsgt.config.scenario import StatusFaultConfig

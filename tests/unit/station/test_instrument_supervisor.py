@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.scripted_instrument import RECORD, ScriptedInstrument
+from harness.instruments.scripted_instrument import RECORD, ScriptedInstrument
 from structlog.testing import capture_logs
 
 from tsgt.errors import InstrumentError, InstrumentRefusedError

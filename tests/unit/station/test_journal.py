@@ -7,7 +7,7 @@ import errno
 import os
 from typing import TYPE_CHECKING
 
-from harness.records import HEADER
+from harness.files.records import HEADER
 
 from tsgt.recording import RecordingWriter
 from tsgt.recording.recorder import Recorder

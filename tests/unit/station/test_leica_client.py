@@ -7,9 +7,9 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.client import client_config
-from harness.leica import LeicaBench, leica_bench
-from harness.radios import PAPER
+from harness.hardware.radios import PAPER
+from harness.instruments.leica import LeicaBench, leica_bench
+from harness.radio.client import client_config
 from structlog.testing import capture_logs
 from unit.station.test_control_socket import WARM, journalled, no_radio, talk
 

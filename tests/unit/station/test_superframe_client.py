@@ -7,9 +7,9 @@ from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.client import START_NS, field_day
-from harness.radios import MS
-from harness.scripted_master import KEY, TIMING, ScriptedMaster
+from harness.hardware.radios import MS
+from harness.radio.client import START_NS, field_day
+from harness.radio.scripted_master import KEY, TIMING, ScriptedMaster
 from structlog.testing import capture_logs
 from unit.station.test_daemon import client_status
 
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
     from pathlib import Path
 
-    from harness.client import Field
-    from harness.scripted_master import ReceivedMessage
+    from harness.radio.client import Field
+    from harness.radio.scripted_master import ReceivedMessage
 
     from tsgt.model import PolarMeasurement
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.clock_exchanges import SECOND, START_NS, WAY_NS, drifting, exchange, synchronisation
+from harness.clocks.clock_exchanges import SECOND, START_NS, WAY_NS, drifting, exchange, synchronisation
 
 from tsgt.timesync.offset_regression import SkewPrior, fit_line, select_samples
 from tsgt.timesync.two_way import ClockFilter, TimestampCheck, clock_filter

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import pytest
-from harness import foxglove_layout
-from harness.records import EVENT, SETUP
-from harness.web import HELLO, in_real_time, pose, served, status
+from harness.files.records import EVENT, SETUP
+from harness.readers import foxglove_layout
+from harness.readers.web import HELLO, in_real_time, pose, served, status
 from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock
@@ -25,7 +25,7 @@ from tsgt.web.state import MissionState
 pytest.importorskip("foxglove", reason="the extra foxglove is not installed (pip install 'tsgt[foxglove]')")
 
 import aiohttp
-from harness.foxglove import SUBPROTOCOL, App, app
+from harness.readers.foxglove import SUBPROTOCOL, App, app
 
 from tsgt.web.foxglove import Feed, FoxgloveServer
 

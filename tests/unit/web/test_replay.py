@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.records import EVENT, HEADER, PARAMETERS, SETUP, START
-from harness.web import pose, status
+from harness.files.records import EVENT, HEADER, PARAMETERS, SETUP, START
+from harness.readers.web import pose, status
 
 from tsgt.errors import RecordingError
 from tsgt.recording import encode_line

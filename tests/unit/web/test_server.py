@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import pytest
-from harness.records import EVENT
-from harness.web import client, feed, in_real_time, mission, pose, served, status
+from harness.files.records import EVENT
+from harness.readers.web import client, feed, in_real_time, mission, pose, served, status
 from structlog.testing import capture_logs
 
 from tsgt.web import connections, server

@@ -5,7 +5,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.web import HELLO, SETUP_LINE, in_real_time, pose, status
+from harness.readers.web import HELLO, SETUP_LINE, in_real_time, pose, status
 from structlog.testing import capture_logs
 
 from tsgt.clock import SystemClock

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from harness.records import IMU_STATUS, ODOMETRY_STATUS, SETUP, START, measurement
-from harness.web import feed, mission, pose, station, status
+from harness.files.records import IMU_STATUS, ODOMETRY_STATUS, SETUP, START, measurement
+from harness.readers.web import feed, mission, pose, station, status
 
 from tsgt.model import ReferencePoint, Status
 from tsgt.recording import DiskStatus, EventRecord, RecordingStatus, SetupRecord, StationShare, encode_line

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.target_field import TargetField
+from harness.instruments.target_field import TargetField
 
 from tsgt.analysis.calibration import TargetCalibration, target_notes
 from tsgt.geometry.target_calibration import calibrate_network

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from harness.paired import drive, noisy, paired
+from harness.drives.paired import drive, noisy, paired
 
 from tsgt.analysis.compare import ReferencePoses
 from tsgt.analysis.compare.completeness import Completeness, completeness

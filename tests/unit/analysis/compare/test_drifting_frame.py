@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from harness.compared_drive import START_NS, reference, robot
+from harness.drives.compared_drive import START_NS, reference, robot
 
 from tsgt.analysis.compare import Estimate
 from tsgt.analysis.compare.drifting_frame import (

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from harness.paired import drive, noisy, paired
+from harness.drives.paired import drive, noisy, paired
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.compare.errors import TRAVEL_COMPONENTS, absolute, error_series, nees

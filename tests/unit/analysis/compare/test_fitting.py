@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from harness.compared_drive import START_NS, long_reference, reference, robot
+from harness.drives.compared_drive import START_NS, long_reference, reference, robot
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 

@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from harness.compared_drive import START_NS, estimate_at, reference, robot
+from harness.drives.compared_drive import START_NS, estimate_at, reference, robot
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.compare import Estimate, ReferencePoses, initial_relation, pair

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.paired import drive, noisy, paired
+from harness.drives.paired import drive, noisy, paired
 
 from tsgt.analysis.compare.relative import drift, explained_motion, relative
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.field_day import START_NS, Kind, calibrated, field_day
+from harness.drives.field_day import START_NS, Kind, calibrated, field_day
 
 from tsgt.analysis.diagnosis import diagnose
 from tsgt.analysis.diagnosis.target_findings import calibration_findings

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.records import PARAMETERS
+from harness.files.records import PARAMETERS
 
 from tsgt.analysis.diagnosis import Finding
 from tsgt.analysis.diagnosis.held_out_finding import Part, held_out_finding

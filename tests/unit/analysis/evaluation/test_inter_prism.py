@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from harness.scene import LAYOUT, SECOND, START, Scene, at_rest, driving, stationary_scene
+from harness.drives.scene import LAYOUT, SECOND, START, Scene, at_rest, driving, stationary_scene
 
 from tsgt.analysis.evaluation import InterPrismDistances, inter_prism
 from tsgt.analysis.evaluation.inter_prism import stationary_intervals

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.records import HEADER, PARAMETERS, POSE, measurement
+from harness.files.records import HEADER, PARAMETERS, POSE, measurement
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.evaluation import LivePoseErrors, LivePoses, read_streamed_poses

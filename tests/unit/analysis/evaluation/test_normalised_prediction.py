@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, measure, sorted_by_time
+from harness.drives.prior_motion import draw_motions, measure, sorted_by_time
 
 from tsgt.analysis.evaluation import (
     HeldOutErrors,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import as_cartesian, draw_motions, measure, sorted_by_time
+from harness.drives.prior_motion import as_cartesian, draw_motions, measure, sorted_by_time
 
 from tsgt.analysis.evaluation import outliers, residual_statistics
 from tsgt.geometry.batch import fit_trajectory

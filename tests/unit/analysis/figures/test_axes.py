@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START
+from harness.drives.scene import SECOND, START
 
 from tsgt.analysis.figures import TimeAxis
 from tsgt.analysis.figures.axes import BUCKETS, thinned

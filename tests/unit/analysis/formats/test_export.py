@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import START, driving, stationary_scene
+from harness.drives.scene import START, driving, stationary_scene
 
 from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness import foxglove_layout
-from harness.records import HEADER
-from harness.scene import FRAMES, LAYOUT, START, driving, stationary_scene
+from harness.drives.scene import FRAMES, LAYOUT, START, driving, stationary_scene
+from harness.files.records import HEADER
+from harness.readers import foxglove_layout
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.pos_files import BASE, SECOND, Variant, write_pos
+from harness.files.pos_files import BASE, SECOND, Variant, write_pos
 
 from tsgt.analysis.formats import QUALITIES, read_pos
 from tsgt.errors import InputFileError

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.authors_files import write_prisms
-from harness.scene import LAYOUT
+from harness.drives.scene import LAYOUT
+from harness.files.authors_files import write_prisms
 
 from tsgt.analysis.formats import read_prisms
 from tsgt.analysis.formats.rts_files import read_track

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.merging import assert_true, journals, merged_in, recording
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions.merging import assert_true, journals, merged_in, recording
+from harness.missions.missions import SUPERFRAME, run_mission
 
 from tsgt.analysis.merge import merge
 from tsgt.analysis.merge.merge import MAX_TIME_BOUND_NS, SESSION_MARGIN_NS

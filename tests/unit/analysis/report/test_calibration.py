@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from harness.records import PARAMETERS, measurement
+from harness.files.records import PARAMETERS, measurement
 
 from tsgt.analysis.report.calibration import calibration_numbers, calibration_section
 from tsgt.model import Matrix4, Parameters, PointMeasurement, TargetResidual

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, Scene, driving, stationary_scene
+from harness.drives.scene import SECOND, START, Scene, driving, stationary_scene
 
 from tsgt.analysis.evaluation import BINS, binned, distances_at_epochs, gridded, inter_prism
 from tsgt.analysis.report.motion import distance_error_series

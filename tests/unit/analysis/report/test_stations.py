@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.scene import SECOND, START, stationary_scene
+from harness.drives.scene import SECOND, START, stationary_scene
 
 from tsgt.analysis.report.log import read_log
 from tsgt.analysis.report.stations import station_records, station_statistics

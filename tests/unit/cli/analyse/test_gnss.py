@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.authors_files import write_prisms, write_tracks
-from harness.pos_files import SECOND, Variant, write_pos
+from harness.files.authors_files import write_prisms, write_tracks
+from harness.files.pos_files import SECOND, Variant, write_pos
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 PAGE = Path(__file__).parents[4] / "docs" / "how-to" / "compare-with-gnss.md"
 START = 1_700_000_000 * SECOND

@@ -13,7 +13,7 @@ import pytest
 from tsgt.analysis.design import inertial_study
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 CONFIGS = Path(__file__).parents[4] / "configs"
 SMALL = """kind = "prism_layout"

@@ -13,7 +13,7 @@ from tsgt.analysis import figures
 from tsgt.analysis.design import inertial_study
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
     from tsgt.model import ReferencePoint
 

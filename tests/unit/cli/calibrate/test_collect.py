@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 import pytest
-from harness.client import client_config
-from harness.field import TRUE, SceneInstrument, Station, field_of
-from harness.radios import PAPER
-from harness.scene import FRAMES
+from harness.drives.scene import FRAMES
+from harness.hardware.radios import PAPER
+from harness.missions.field import TRUE, SceneInstrument, Station, field_of
+from harness.radio.client import client_config
 
 from tsgt.analysis.calibration import TargetCollection, check_station, mean_points
 from tsgt.analysis.formats import read_partial_target_file, read_target_file
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
     from pathlib import Path
 
-    from harness.cli import Tsgt
-    from harness.field import Field
+    from harness.files.cli import Tsgt
+    from harness.missions.field import Field
 
     from tsgt.radio import RadioOpener
     from tsgt.station import Reading

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.target_field import TargetField
+from harness.instruments.target_field import TargetField
 
 from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_calibration
 from tsgt.geometry.target_calibration import InstrumentError
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 REFERENCE = Path(__file__).parents[4] / "docs" / "reference" / "target-file.md"
 HOW_TO = Path(__file__).parents[4] / "docs" / "how-to" / "calibrate.md"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.imu_calibration import UncalibratedDrive, uncalibrated_drive, write_imu_recording
+from harness.inertial.imu_calibration import UncalibratedDrive, uncalibrated_drive, write_imu_recording
 
 from tsgt.analysis.calibration import calibrate_recorded_imu
 from tsgt.config import IMU_NOISE, load_imu_mounting
@@ -18,7 +18,7 @@ from tsgt.recording import encode_line, load_recording, read_imu_samples
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 @pytest.fixture(scope="module")

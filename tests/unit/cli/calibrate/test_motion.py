@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.analysis.calibration import calibrate_recording
 from tsgt.config import load_station_calibration
@@ -18,8 +18,8 @@ from tsgt.recording import load_recording
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
-    from harness.scene import Motion
+    from harness.drives.scene import Motion
+    from harness.files.cli import Tsgt
 
 
 def winding(time_s: float) -> Motion:

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.cli import called
-from harness.paired import drive, noisy
+from harness.drives.paired import drive, noisy
+from harness.files.cli import called
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry import invert, quaternion_from_rotation, transform_from
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 EXAMPLE = Path(__file__).parents[4] / "examples" / "compare_estimates.py"
 

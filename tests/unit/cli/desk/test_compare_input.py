@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.paired import drive
-from harness.pose_files import (
+from harness.drives.paired import drive
+from harness.files.pose_files import (
     Poses,
     pose_stamped,
     seconds,
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 START_NS = 1_780_000_000_000_000_000
 TRUE = drive(600, 10.0, speed_mps=1.5)

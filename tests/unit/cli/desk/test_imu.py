@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.imu_recording import IMU, imu_recording, shaken_drive, write
-from harness.records import HEADER, START
+from harness.files.records import HEADER, START
+from harness.inertial.imu_recording import IMU, imu_recording, shaken_drive, write
 
 from tsgt.analysis.formats import write_imu_mounting
 from tsgt.analysis.report import collect_findings, report_numbers, sections
@@ -18,8 +18,8 @@ from tsgt.recording import encode_line
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
-    from harness.inertial_drive import InertialDrive
+    from harness.files.cli import Tsgt
+    from harness.inertial.inertial_drive import InertialDrive
 
 
 @pytest.fixture(scope="module")

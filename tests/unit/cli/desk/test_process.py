@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
-from harness.scene import FRAMES, LAYOUT
+from harness.drives.scene import FRAMES, LAYOUT
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.analysis.formats.export import MEASUREMENT_COLUMNS, POSE_COLUMNS
 
 if TYPE_CHECKING:
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 DOCUMENT = Path(__file__).parents[4] / "docs" / "reference" / "evaluate.md"
 

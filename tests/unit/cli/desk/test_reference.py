@@ -6,12 +6,12 @@ import re
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.authors_files import write_prisms, write_tracks
+from harness.files.authors_files import write_prisms, write_tracks
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
-from harness.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
-from harness.scene import at_rest, driving
+from harness.drives.scene import at_rest, driving
+from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import read_stationary_intervals
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from harness.cli import Tsgt
-    from harness.scene import Motion
+    from harness.drives.scene import Motion
+    from harness.files.cli import Tsgt
 
 FIGURES = {
     "calibration",

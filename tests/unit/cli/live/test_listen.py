@@ -10,15 +10,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
-from harness.stream_lines import serving
+from harness.files.records import EVENT, HELLO, NO_POSE, POINT, POSE, STATUS, measurement
+from harness.files.stream_lines import serving
 
 from tsgt.recording import encode_line
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 LINES = [encode_line(record) for record in (HELLO, measurement(0), POINT, POSE, NO_POSE, STATUS, EVENT)]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 import pytest
-from harness.records import IMU_STATUS, ODOMETRY_STATUS
+from harness.files.records import IMU_STATUS, ODOMETRY_STATUS
 
 from tsgt.cli.live.status_text import client_text, duration, master_text, station_label
 from tsgt.model import Status
@@ -22,7 +22,7 @@ from tsgt.station.status import LastMeasurement
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 NOW_NS = 1_700_000_000_000_000_000
 WIDTH = 40

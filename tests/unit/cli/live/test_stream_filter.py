@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from harness.records import CLOCK, EVENT, HELLO, POINT, POSE, SETUP, START, STATUS, measurement
+from harness.files.records import CLOCK, EVENT, HELLO, POINT, POSE, SETUP, START, STATUS, measurement
 
 from tsgt.cli.live.stream_filter import StreamFilter
 from tsgt.recording import BeaconRecord, encode_line

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 import pytest
-from harness.records import EVENT, HELLO, POSE, STATUS
+from harness.files.records import EVENT, HELLO, POSE, STATUS
 
 from tsgt.cli.live.follower import RETRY_INTERVAL_S, StreamFollower
 from tsgt.cli.live.pose_text import pose_block, worst_sigmas

@@ -21,7 +21,7 @@ from tsgt.simulation.lora import Air, LinkModel, SimulatedHal, SX1276Chip, simul
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
     from tsgt.radio import Radio
     from tsgt.radio.ping import Exchange

@@ -14,7 +14,7 @@ from tsgt.radio.key_file import read_key
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 
 def test_key_command_writes_a_key_and_prints_instructions(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 SUPERFRAME = ("radio", "plan", "--protocol", "superframe", "--stations")
 CLASSIC = ("radio", "plan", "--protocol", "classic", "--stations")

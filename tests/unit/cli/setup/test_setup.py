@@ -6,8 +6,8 @@ import hashlib
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.fake_machine import ADAPTER
-from harness.setup_system import PiToSetUp
+from harness.hardware.fake_machine import ADAPTER
+from harness.hardware.setup_system import PiToSetUp
 
 from tsgt import service
 from tsgt.cli import doctor
@@ -20,7 +20,7 @@ from tsgt.simulation.kernel import run_virtual
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Outcome, Tsgt
+    from harness.files.cli import Outcome, Tsgt
 
 KEY = hashlib.sha256(b"a key").digest()
 MISSION = encode_mission(

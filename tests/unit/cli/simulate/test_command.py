@@ -18,7 +18,7 @@ from tsgt.simulation.mission.run_log import START_UNIX_NS
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
     from numpy.typing import NDArray
 
 START_S = START_UNIX_NS / 1e9

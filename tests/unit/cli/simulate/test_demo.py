@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.records import POSE
+from harness.files.records import POSE
 
 from tsgt.analysis.evaluation import PoseErrors, pose_errors
 from tsgt.cli.simulate.demo_progress import Progress

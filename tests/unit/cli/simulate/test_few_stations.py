@@ -9,7 +9,7 @@ import pytest
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
 LIMITS = {
     1: (0.9, 10.0),

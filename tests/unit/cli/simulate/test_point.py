@@ -15,7 +15,7 @@ from tsgt.estimation import parse_reference_point
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from harness.cli import Tsgt
+    from harness.files.cli import Tsgt
 
     from tsgt.config import ScenarioConfig
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.prior_motion import draw_motions, measure, rows_at, sorted_by_time
-from harness.slow_motion import measure_along
+from harness.drives.prior_motion import draw_motions, measure, rows_at, sorted_by_time
+from harness.drives.slow_motion import measure_along
 
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.trajectory.motion_prior import axis_sigmas

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, measure, sorted_by_time
+from harness.drives.prior_motion import draw_motions, measure, sorted_by_time
 
 from tsgt.errors import GeometryError
 from tsgt.geometry.batch import fit as fitting

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
-from harness.slow_motion import braking, measure_along
+from harness.drives.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
+from harness.drives.slow_motion import braking, measure_along
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import exp_so3, log_so3

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.slow_motion import creeping, measure_along
+from harness.drives.slow_motion import creeping, measure_along
 
 from tsgt.geometry.batch.noise_scales import MIN_SCALE, min_scales
 from tsgt.geometry.rest import RestInterval

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import CENTRE_M
-from harness.slow_motion import LINE_OF_SIGHT, braking, creeping, measure_along
+from harness.drives.prior_motion import CENTRE_M
+from harness.drives.slow_motion import LINE_OF_SIGHT, braking, creeping, measure_along
 
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.rest import RestInterval, in_rest, rest_factors, steps_in_rest, with_vibration

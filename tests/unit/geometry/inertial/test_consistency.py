@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness import inertial_drive as harness
-from harness.inertial_drive import imu_parameters, inertial_drive
+from harness.inertial import inertial_drive as harness
+from harness.inertial.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.geometry import log_so3
 from tsgt.geometry.inertial import (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from harness.inertial_drive import DEG, GRADES
+from harness.inertial.inertial_drive import DEG, GRADES
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry.inertial import InertialSamples, contiguous

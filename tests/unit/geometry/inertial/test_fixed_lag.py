@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.inertial_drive import DEG, imu_parameters, inertial_drive, standing_from
+from harness.inertial.inertial_drive import DEG, imu_parameters, inertial_drive, standing_from
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.inertial_drive import imu_parameters, inertial_drive
+from harness.inertial.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.geometry import FloatArray, exp_so3
 from tsgt.geometry.inertial import (

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.inertial_drive import DEG, imu_parameters, inertial_drive
+from harness.inertial.inertial_drive import DEG, imu_parameters, inertial_drive
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import log_so3

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.inertial_drive import GRADES, imu_parameters, inertial_drive
+from harness.inertial.inertial_drive import GRADES, imu_parameters, inertial_drive
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry.inertial import (

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from harness.inertial_drive import imu_parameters, inertial_drive
+from harness.inertial.inertial_drive import imu_parameters, inertial_drive
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import FloatArray, exp_so3, log_so3

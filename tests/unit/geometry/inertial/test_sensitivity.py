@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.inertial_drive import imu_parameters, inertial_drive
+from harness.inertial.inertial_drive import imu_parameters, inertial_drive
 from scipy.spatial.transform import Rotation
 
 from tsgt.geometry.inertial import InertialFixedLagSmoother, fit_inertial_trajectory

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.imu_calibration import uncalibrated_drive
+from harness.inertial.imu_calibration import uncalibrated_drive
 
 from tsgt.geometry.inertial_calibration import (
     ImuCalibration,

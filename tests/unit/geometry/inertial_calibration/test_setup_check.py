@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.imu_calibration import uncalibrated_drive
+from harness.inertial.imu_calibration import uncalibrated_drive
 
 from tsgt.geometry import exp_so3
 from tsgt.geometry.batch import fit_trajectory

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.drive import LAYOUT, MOTION_PRIOR, drive, frames
+from harness.drives.drive import LAYOUT, MOTION_PRIOR, drive, frames
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import exp_so3

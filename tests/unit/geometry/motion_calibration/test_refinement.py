@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.drive import LAYOUT, MOTION_PRIOR, drive
+from harness.drives.drive import LAYOUT, MOTION_PRIOR, drive
 
 from tsgt.geometry import exp_so3
 from tsgt.geometry.motion_calibration import Setup, SetupParameters, calibrated_covariance, refine_setup

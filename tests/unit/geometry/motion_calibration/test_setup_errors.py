@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import draw_motions, measure, sorted_by_time
+from harness.drives.prior_motion import draw_motions, measure, sorted_by_time
 
 from tsgt.geometry.motion_calibration.setup_errors import (
     FRAME,

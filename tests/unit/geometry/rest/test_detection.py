@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from harness.prior_motion import as_cartesian
-from harness.slow_motion import braking, creeping, measure_along
+from harness.drives.prior_motion import as_cartesian
+from harness.drives.slow_motion import braking, creeping, measure_along
 
 from tsgt.geometry.rest import MARGIN_S, find_rest
 

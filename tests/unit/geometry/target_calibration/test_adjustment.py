@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness.target_field import TargetField, frame_nees
+from harness.instruments.target_field import TargetField, frame_nees
 from scipy.optimize import least_squares
 
 from tsgt.errors import DegenerateGeometryError

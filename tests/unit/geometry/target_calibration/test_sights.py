@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.target_field import TargetField
+from harness.instruments.target_field import TargetField
 
 from tsgt.geometry.target_calibration import AIM, MOVED, READINGS, SightError, calibrate_network, sight_error
 from tsgt.model import TARGET_NOISE

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.manoeuvre import speeding_up_and_turning_back
-from harness.prior_motion import draw_motions, measure, rows_at, sorted_by_time
+from harness.drives.manoeuvre import speeding_up_and_turning_back
+from harness.drives.prior_motion import draw_motions, measure, rows_at, sorted_by_time
 
 from tsgt.geometry.trajectory import FixedLagSmoother, Observations
 from tsgt.geometry.trajectory.fixed_lag import PREDICTION_NOISE_SCALE

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import (
+from harness.drives.prior_motion import (
     SIGMAS_M,
     STEP_S,
     as_cartesian,
@@ -16,7 +16,7 @@ from harness.prior_motion import (
     rows_at,
     sorted_by_time,
 )
-from harness.scene import FRAMES, LAYOUT
+from harness.drives.scene import FRAMES, LAYOUT
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from harness.field_day import START_NS, calibrated, field_day
+from harness.drives.field_day import START_NS, calibrated, field_day
 
 from tsgt.estimation import build_observations
 from tsgt.geometry.trajectory import initial_guess, knot_times, solve

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pytest
-from harness.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
+from harness.drives.prior_motion import STEP_S, draw_motions, measure, rows_at, sorted_by_time
 from scipy.stats import chi2
 
 from tsgt.geometry import exp_so3, log_so3

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.prior_motion import CENTRE_M
-from harness.slow_motion import LINE_OF_SIGHT, creeping, measure_along
+from harness.drives.prior_motion import CENTRE_M
+from harness.drives.slow_motion import LINE_OF_SIGHT, creeping, measure_along
 
 from tsgt.geometry.trajectory import FixedLagSmoother, LinearisedMeasurements, Observations
 from tsgt.geometry.trajectory.rest_window import HISTORY_S

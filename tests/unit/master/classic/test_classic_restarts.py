@@ -7,11 +7,11 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.radios import MS
-from harness.single_station import SECOND, single_station
+from harness.hardware.radios import MS
+from harness.radio.single_station import SECOND, single_station
 
 if TYPE_CHECKING:
-    from harness.single_station import SingleStation
+    from harness.radio.single_station import SingleStation
 
 STEP_NS = 30 * MS
 """Less than a measurement's time can show, more than a stamp's bound."""

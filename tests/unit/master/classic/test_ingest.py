@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import hypothesis.strategies as st
 import pytest
-from harness.scene import START
+from harness.drives.scene import START
 from hypothesis import given
 from hypothesis import settings as limits
 

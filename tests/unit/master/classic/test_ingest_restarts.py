@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from harness.clock_exchanges import SECOND, START_NS, synchronisation
+from harness.clocks.clock_exchanges import SECOND, START_NS, synchronisation
 
 from tsgt.master.classic.ingest import StationIngest
 from tsgt.radio.classic import MeasurementMessage

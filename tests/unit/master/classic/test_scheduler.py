@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from harness.radios import PAPER
+from harness.hardware.radios import PAPER
 
 from tsgt.master.classic.scheduler import (
     ScheduledTransaction,

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.field import TRUE
-from harness.radios import MS, PAPER, Bench, bench
+from harness.hardware.radios import MS, PAPER, Bench, bench
+from harness.missions.field import TRUE
 
 from tsgt.clock import UnixTimeline
 from tsgt.errors import RadioError

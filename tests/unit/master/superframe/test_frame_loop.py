@@ -8,9 +8,9 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.field import running
-from harness.radios import MS, Bench, bench
-from harness.scripted_stations import KEY, TIMING, counted
+from harness.hardware.radios import MS, Bench, bench
+from harness.missions.field import running
+from harness.radio.scripted_stations import KEY, TIMING, counted
 
 from tsgt.master.superframe import FrameLoop
 from tsgt.radio.superframe import FramePlan, SuperframeMaster

@@ -14,8 +14,8 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from harness.field import STATIONS, TRUE, field_of, running
-from harness.scene import START, driving, stationary_scene
+from harness.drives.scene import START, driving, stationary_scene
+from harness.missions.field import STATIONS, TRUE, field_of, running
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RecordingError
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
     from pathlib import Path
 
-    from harness.field import Field
+    from harness.missions.field import Field
 
     from tsgt.radio import Radio, Transmission
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
-from harness.radios import MS, PAPER
+from harness.hardware.radios import MS, PAPER
 
 from tsgt.radio.classic import ClassicStation, LinkTiming, Synchronisation
 from tsgt.radio.classic.messages import TimeReply

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from harness.radios import MS, PAPER
+from harness.hardware.radios import MS, PAPER
 
 from tsgt.radio import TX_DONE_NS, LoRaSettings
 from tsgt.radio.classic import (

@@ -9,14 +9,14 @@ from random import Random
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.scripted_stations import KEY, TIMING
-from harness.superframe_loop import MS, START_NS, SuperframeLoop
+from harness.radio.scripted_stations import KEY, TIMING
+from harness.radio.superframe_loop import MS, START_NS, SuperframeLoop
 
 from tsgt.radio.superframe.master import MAX_FRAMES_PER_SESSION
 from tsgt.radio.superframe.wire import SESSION_TIME_BITS, Authenticator
 
 if TYPE_CHECKING:
-    from harness.superframe_loop import LoopStation
+    from harness.radio.superframe_loop import LoopStation
 
 SESSION_TIME_WRAP_NS = 1000 << SESSION_TIME_BITS
 BEFORE_NS = 20_000 * MS

@@ -6,8 +6,8 @@ from random import Random
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.scripted_stations import KEY, TIMING
-from harness.superframe_loop import MS, SuperframeLoop
+from harness.radio.scripted_stations import KEY, TIMING
+from harness.radio.superframe_loop import MS, SuperframeLoop
 
 from tsgt.radio import DirectCommand
 from tsgt.radio.superframe.wire import Authenticator
@@ -15,7 +15,7 @@ from tsgt.radio.superframe.wire import Authenticator
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from harness.superframe_loop import LoopStation
+    from harness.radio.superframe_loop import LoopStation
 
 DELAYS_NS = (300_000, 3 * MS, 30 * MS)
 LONG_DELAYS_NS = (66 * MS, 80 * MS, 131 * MS, 248 * MS)

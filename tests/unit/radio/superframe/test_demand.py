@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from harness.radios import PAPER
-from harness.scripted_stations import TIMING
+from harness.hardware.radios import PAPER
+from harness.radio.scripted_stations import TIMING
 
 from tsgt.radio.superframe import FrameTiming
 from tsgt.radio.superframe.demand import (

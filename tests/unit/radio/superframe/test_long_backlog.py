@@ -5,8 +5,8 @@ from __future__ import annotations
 from random import Random
 
 import pytest
-from harness.scripted_stations import KEY, TIMING
-from harness.superframe_loop import MS, SuperframeLoop
+from harness.radio.scripted_stations import KEY, TIMING
+from harness.radio.superframe_loop import MS, SuperframeLoop
 
 from tsgt.radio.superframe.wire import Authenticator
 

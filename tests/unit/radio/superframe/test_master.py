@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import pytest
-from harness.radios import MS
-from harness.scripted_stations import KEY, TIMING, ZERO_NS, ScriptedFrames, measurement, scripted_frames
+from harness.hardware.radios import MS
+from harness.radio.scripted_stations import KEY, TIMING, ZERO_NS, ScriptedFrames, measurement, scripted_frames
 
 from tsgt.model import Status
 from tsgt.radio import DirectCommand, Direction, MeasureCommand, SearchCommand, TrackCommand

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from harness.radios import MS, PAPER
+from harness.hardware.radios import MS, PAPER
 
 from tsgt.radio.superframe import COMPOSE_LEAD_NS, FramePlan, FrameTiming, PhaseLock
 from tsgt.radio.superframe.wire import GRANT_BYTES, SlotOrder

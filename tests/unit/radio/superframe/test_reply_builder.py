@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from harness.scripted_master import queued
+from harness.radio.scripted_master import queued
 from hypothesis import given
 from hypothesis import strategies as st
 

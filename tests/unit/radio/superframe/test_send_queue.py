@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.scripted_master import queued
+from harness.radio.scripted_master import queued
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.radios import MS
-from harness.scripted_master import (
+from harness.hardware.radios import MS
+from harness.radio.scripted_master import (
     KEY,
     SECOND,
     TIMING,
@@ -34,7 +34,7 @@ from tsgt.radio.superframe.wire import (
 )
 
 if TYPE_CHECKING:
-    from harness.scripted_master import ReceivedMessage
+    from harness.radio.scripted_master import ReceivedMessage
 
     from tsgt.radio.superframe import BeaconReception, SuperframeStation
 

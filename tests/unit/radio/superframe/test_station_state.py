@@ -5,8 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from harness.radios import MS
-from harness.scripted_stations import TIMING, ZERO_NS, ScriptedFrames, measurement, older, scripted_frames
+from harness.hardware.radios import MS
+from harness.radio.scripted_stations import (
+    TIMING,
+    ZERO_NS,
+    ScriptedFrames,
+    measurement,
+    older,
+    scripted_frames,
+)
 
 from tsgt.model import Status
 from tsgt.radio import MeasureCommand

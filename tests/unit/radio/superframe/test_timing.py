@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from harness.radios import MS
+from harness.hardware.radios import MS
 
 from tsgt.radio.superframe.timing import BeaconDelayMonitor
 

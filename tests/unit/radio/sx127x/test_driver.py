@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 import pytest
-from harness.radios import MS, PAPER, bench, make_side
+from harness.hardware.radios import MS, PAPER, bench, make_side
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RadioSettingsError

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.radios import MS, PAPER, Bench, bench, make_side, running_timeline
+from harness.hardware.radios import MS, PAPER, Bench, bench, make_side, running_timeline
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RadioNotFoundError, RadioTimeoutError

@@ -10,8 +10,8 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from harness.pi import LINE, FakePi, FakeRpiGpio
-from harness.radios import PAPER, make_side, running_timeline
+from harness.hardware.pi import LINE, FakePi, FakeRpiGpio
+from harness.hardware.radios import PAPER, make_side, running_timeline
 
 from tsgt.errors import RadioError, RadioNotFoundError, RadioSettingsError
 from tsgt.radio.sx127x import DRAGINO_HAT, Edge, SX127x, Wiring, hal, open_hal

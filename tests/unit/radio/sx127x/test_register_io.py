@@ -3,7 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from harness.radios import PAPER
+from harness.hardware.radios import PAPER
 
 from tsgt.radio import BANDWIDTHS_HZ, LoRaSettings
 from tsgt.radio.sx127x import Mode, Register

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness.records import PARAMETERS, SECOND, START, measurement
+from harness.files.records import PARAMETERS, SECOND, START, measurement
 
 from tsgt.geometry import exp_so3, transform_from
 from tsgt.recording import EventRecord

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.records import PARAMETERS, START, measurement
+from harness.files.records import PARAMETERS, START, measurement
 
 from tsgt.geometry import quaternion_from_rotation
 from tsgt.simulation.checks.poses.covariance_scale import mean_of_correlated, scale_failures

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from harness.records import PARAMETERS, START
+from harness.files.records import PARAMETERS, START
 
 from tsgt.recording.setup_record import SetupRecord
 from tsgt.simulation.checks.setup_lines import beacon_failures, setup_failures

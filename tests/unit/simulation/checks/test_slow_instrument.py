@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.records import HEADER, measurement
+from harness.files.records import HEADER, measurement
 
 from tsgt.recording import encode_line
 from tsgt.recording.journal import JournalRecord

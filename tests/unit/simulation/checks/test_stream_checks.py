@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.records import (
+from harness.files.records import (
     CLOCK,
     EVENT,
     HEADER,

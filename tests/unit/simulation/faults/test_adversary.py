@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
-from harness.plain_radio import PlainRadio
+from harness.radio.plain_radio import PlainRadio
 
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.lora.adversary import MAX_NOISE_BYTES, ReplayAttacker

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.missions import QUICK, SUPERFRAME, run_mission
+from harness.missions.missions import QUICK, SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig
 from tsgt.errors import ConfigError

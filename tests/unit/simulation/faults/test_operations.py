@@ -9,7 +9,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from harness.missions import run_linear_drive
+from harness.missions.missions import run_linear_drive
 
 from tsgt.recording import load_recording
 from tsgt.recording.recorder import Recorder

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import run_linear_drive
+from harness.missions.missions import run_linear_drive
 
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.faults import Fault, FaultKind, inject_fault

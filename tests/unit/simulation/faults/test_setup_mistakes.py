@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.missions import run_linear_drive
+from harness.missions.missions import run_linear_drive
 from structlog.testing import capture_logs
 
 from tsgt.simulation.checks import check_invariants

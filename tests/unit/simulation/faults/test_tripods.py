@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import run_linear_drive
+from harness.missions.missions import run_linear_drive
 
 from tsgt.config import ScenarioConfig
 from tsgt.simulation.checks import check_invariants

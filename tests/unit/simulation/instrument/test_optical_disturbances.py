@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from harness.total_stations import SETUP, SILENT, STANDING, Bench, with_station
+from harness.instruments.total_stations import SETUP, SILENT, STANDING, Bench, with_station
 
 from tsgt.config import ScenarioConfig
 from tsgt.simulation.instrument.edm import EdmSchedule

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from harness.total_stations import Bench
+from harness.instruments.total_stations import Bench
 
 from tsgt.errors import InstrumentError
 from tsgt.simulation.instrument import LineFault

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from harness.total_stations import SETUP, SILENT, STANDING, Bench, RawReply, with_station
+from harness.instruments.total_stations import SETUP, SILENT, STANDING, Bench, RawReply, with_station
 
 from tsgt.config import MotionConfig, ScenarioConfig, scenario_parameters
 from tsgt.config.scenario import StatusFaultConfig

@@ -3,7 +3,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from harness.air import (
+from harness.radio.air import (
     SYMBOL_NS,
     RecordingListener,
     Scene,

@@ -1,11 +1,11 @@
-"""Conformance points 12, 15 and 16 (channel) of facts/radio.md 12.4; those of the chip are in test_chip_conformance*.py."""
+"""Conformance points 12, 15 and 16 (channel) of docs/explanation/simulated-radio.md; those of the chip are in test_chip_conformance*.py."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.air import SYMBOL_NS, Scene, frame, listening, modulation
+from harness.radio.air import SYMBOL_NS, Scene, frame, listening, modulation
 
 from tsgt.simulation.lora import LinkModel
 from tsgt.simulation.lora.link import FixedLoss

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from harness.air import RecordingListener, Scene, frame, link_with_snr, listening
+from harness.radio.air import RecordingListener, Scene, frame, link_with_snr, listening
 
 from tsgt.simulation.lora import LinkModel
 from tsgt.simulation.lora.link import detection_probability, header_probability, payload_probability

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import pytest
-from harness.air import SYMBOL_NS, RecordingListener, frame, listening, modulation
-from harness.radios import running_timeline
+from harness.hardware.radios import running_timeline
+from harness.radio.air import SYMBOL_NS, RecordingListener, frame, listening, modulation
 from structlog.testing import capture_logs
 
 from tsgt.errors import StreamError

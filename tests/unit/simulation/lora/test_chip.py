@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from harness.chips import (
+from harness.hardware.chips import (
     CAD,
     FSRX,
     FSTX,

@@ -1,4 +1,4 @@
-"""Conformance list for simulated chips (facts/radio.md 12.4), points 1 to 6, 13, 19, 20: bus, registers, transmission.
+"""Conformance list for simulated chips (docs/explanation/simulated-radio.md), points 1 to 6, 13, 19, 20: bus, registers, transmission.
 
 Points 7, 17 and 18 are in test_chip_conformance_timing.py, 8 to 12 and 14 in test_chip_conformance_receiving.py, 15 and
 16 in test_air_conformance.py.
@@ -7,7 +7,7 @@ Points 7, 17 and 18 are in test_chip_conformance_timing.py, 8 to 12 and 14 in te
 from __future__ import annotations
 
 import pytest
-from harness.chips import CAD, RXCONTINUOUS, RXSINGLE, SLEEP, STDBY, TX, Bench
+from harness.hardware.chips import CAD, RXCONTINUOUS, RXSINGLE, SLEEP, STDBY, TX, Bench
 
 MASK, FLAGS = 0x11, 0x12
 RX_DONE, CRC_ERROR, VALID_HEADER, TX_DONE = 0x40, 0x20, 0x10, 0x08

@@ -1,4 +1,4 @@
-"""Conformance list for simulated chips (facts/radio.md 12.4), points 8 to 12 and 14: reception."""
+"""Conformance list for simulated chips (docs/explanation/simulated-radio.md), points 8 to 12 and 14: reception."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from harness.chips import CAD, FSRX, FSTX, RXCONTINUOUS, RXSINGLE, SLEEP, STDBY, TX, Bench
+from harness.hardware.chips import CAD, FSRX, FSTX, RXCONTINUOUS, RXSINGLE, SLEEP, STDBY, TX, Bench
 
 from tsgt.simulation.kernel import VirtualTimeline
 from tsgt.simulation.lora import Air, LinkModel

@@ -1,10 +1,10 @@
-"""Conformance list for simulated chips (facts/radio.md 12.4), points 7, 17 and 18: pins, timing, the authors' node."""
+"""Conformance list for simulated chips (docs/explanation/simulated-radio.md), points 7, 17 and 18: pins, timing, the authors' node."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from harness.chips import CAD, SLEEP, Bench
+from harness.hardware.chips import CAD, SLEEP, Bench
 
 from tsgt.simulation.lora.modem import ChipTiming
 
@@ -134,7 +134,7 @@ def test_conformance_17_airtime_by_the_formula() -> None:
 
 
 def write_as_norlab(bench: Bench) -> None:
-    """Initialise as the authors' lora_radio.cpp does, in its order (facts/radio.md 10)."""
+    """Initialise as the authors' lora_radio.cpp does, in its order."""
     for address, value in (
         *((0x01, bench.read(0x01) & 0xF8), (0x01, 0x88), (0x06, 0xE2), (0x07, 0x40), (0x08, 0x00)),
         *((0x39, 0x34), (0x26, 0x04), (0x1D, 0x84), (0x1E, 0x94), (0x1F, 0x08), (0x23, 0xFF), (0x22, 0x40)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from harness.chips import CAD, SLEEP, STDBY, Bench
+from harness.hardware.chips import CAD, SLEEP, STDBY, Bench
 
 from tsgt.simulation.lora.frames import Header, Reception
 

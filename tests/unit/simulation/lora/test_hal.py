@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from harness.chips import NO_JITTER, Bench
+from harness.hardware.chips import NO_JITTER, Bench
 
 from tsgt.simulation.kernel import run_virtual
 from tsgt.simulation.lora import SimulatedHal

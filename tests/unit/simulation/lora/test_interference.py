@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from harness.air import modulation
+from harness.radio.air import modulation
 
 from tsgt.simulation.lora.interference import is_above_interference, required_sir_db
 

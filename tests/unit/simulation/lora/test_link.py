@@ -17,7 +17,7 @@ from tsgt.simulation.lora.link import (
 
 ERROR_RATES = (0.9, 0.5, 0.1, 0.01)
 
-# SNR in dB for these packet error rates: facts/radio.md 6.2, exact theory of non-coherent detection.
+# SNR in dB for these packet error rates: exact theory of non-coherent detection.
 THEORY = {
     (7, 15, 6): (-10.59, -9.57, -8.39, -7.32),
     (7, 34, 6): (-9.90, -9.03, -8.00, -7.02),
@@ -94,7 +94,7 @@ def test_probabilities_stay_in_range_at_extremes() -> None:
 
 
 def test_noise_floor() -> None:
-    """A receiver with 6.5 dB has a floor of -113.5 dBm in 250 kHz (facts/radio.md 6.1)."""
+    """A receiver with 6.5 dB has a floor of -113.5 dBm in 250 kHz."""
     assert noise_dbm(250_000, 6.5) == pytest.approx(-113.5, abs=0.05)
 
 

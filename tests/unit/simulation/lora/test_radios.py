@@ -6,7 +6,7 @@ import asyncio
 
 import numpy as np
 import pytest
-from harness.radios import MS, PAPER, running_timeline
+from harness.hardware.radios import MS, PAPER, running_timeline
 
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.lora import Air, HostDelay, LinkModel, TimestampJitter, radio_opener

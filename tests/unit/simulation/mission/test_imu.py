@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.imu_faults import Drive, confirm_once
-from harness.missions import SUPERFRAME, run_mission
+from harness.inertial.imu_faults import Drive, confirm_once
+from harness.missions.missions import SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig, SimulatedImu
 from tsgt.estimation import centroid_at_point, imu_setup_monitor

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import SUPERFRAME, run_mission
+from harness.missions.missions import SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig, SimulatedImu
 from tsgt.master.replay import replayed

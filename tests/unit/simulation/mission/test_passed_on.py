@@ -6,8 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.missions import run_linear_drive
-from harness.passed_on import PassedOn
+from harness.missions.missions import run_linear_drive
+from harness.missions.passed_on import PassedOn
 
 from tsgt.simulation.mission import MASTER
 

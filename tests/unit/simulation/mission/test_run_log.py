@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from harness.records import POSE, START
+from harness.files.records import POSE, START
 
 from tsgt.simulation.mission.run_log import MasterLog
 

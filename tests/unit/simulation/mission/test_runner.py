@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.missions import QUICK, SUPERFRAME, linear_drive, run_mission
+from harness.missions.missions import QUICK, SUPERFRAME, linear_drive, run_mission
 
 from tsgt.cli.simulate.figures import figures, frame_ms, outage_figures, station_figures
 from tsgt.cli.simulate.poses import estimator_figures

@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.missions import SUPERFRAME, run_mission
-from harness.records import START
-from harness.web import feed, mission, pose
+from harness.files.records import START
+from harness.missions.missions import SUPERFRAME, run_mission
+from harness.readers.web import feed, mission, pose
 
 from tsgt.cli.live.status_text import master_text
 from tsgt.recording import EventRecord, StatusRecord, decode, read_lines

@@ -5,7 +5,7 @@ import random
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.bridge import COMMANDS, HELLO, FakeProgram, FakeStart, measured
+from harness.instruments.bridge import COMMANDS, HELLO, FakeProgram, FakeStart, measured
 from structlog.testing import capture_logs
 
 from tsgt.config import BridgeInstrumentConfig

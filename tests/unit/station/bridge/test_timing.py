@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.bridge import HELLO, measured
+from harness.instruments.bridge import HELLO, measured
 
 from tsgt.recording import decode
 from tsgt.station.bridge.messages import HelloLine, MeasurementLine

@@ -7,7 +7,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.geocom_line import (
+from harness.instruments.geocom_line import (
     REPLY_S,
     Cable,
     FakeInstrument,
@@ -27,7 +27,7 @@ from tsgt.simulation.kernel import VirtualClock
 from tsgt.station.geocom import GeoComConnection, Rpc, connect
 
 if TYPE_CHECKING:
-    from harness.geocom_line import Fault, MemoryPort
+    from harness.instruments.geocom_line import Fault, MemoryPort
 
 MS = 1_000_000
 

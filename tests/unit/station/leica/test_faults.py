@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.leica import leica_bench, leica_config
+from harness.instruments.leica import leica_bench, leica_config
 
 from tsgt.errors import InstrumentError
 from tsgt.simulation.instrument import LineFault
@@ -16,11 +16,11 @@ from tsgt.simulation.instrument.total_station import BOOT_NS
 from tsgt.station.geocom import ReturnCode, Rpc
 
 if TYPE_CHECKING:
-    from harness.leica import LeicaBench
+    from harness.instruments.leica import LeicaBench
 
     from tsgt.station import Reading
 
-# A changed digit is detected by a checksum only: see harness/serial_scripts.py.
+# A changed digit is detected by a checksum only: see harness/instruments/serial_scripts.py.
 FAULTS = [fault for fault in LineFault if fault not in (LineFault.NONE, LineFault.WRONG_DIGIT)]
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness.leica import LeicaBench, leica_bench, leica_config
-from harness.total_stations import STANDING
+from harness.instruments.leica import LeicaBench, leica_bench, leica_config
+from harness.instruments.total_stations import STANDING
 from structlog.testing import capture_logs
 
 from tsgt.config import InstrumentModelConfig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from harness.leica import leica_bench, leica_config
+from harness.instruments.leica import leica_bench, leica_config
 
 from tsgt.config import InstrumentModelConfig
 from tsgt.config.scenario import StatusFaultConfig

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from harness.leica import LeicaBench, leica_bench, leica_config
+from harness.instruments.leica import LeicaBench, leica_bench, leica_config
 from structlog.testing import capture_logs
 
 from tsgt.config import TcpAddress

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.radios import MS
+from harness.hardware.radios import MS
 
 from tsgt.clock import SuspensionWatch, UnixTimeline
 from tsgt.errors import ComputerSuspendedError, RadioError

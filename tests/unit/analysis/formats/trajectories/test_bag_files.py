@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from harness.pose_files import (
+from harness.files.pose_files import (
     Poses,
     fix,
     odometry,

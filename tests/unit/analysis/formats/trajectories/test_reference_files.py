@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.pose_files import Poses, write_tum
-from harness.records import recording_bytes
-from harness.scene import START, driving, stationary_scene
+from harness.drives.scene import START, driving, stationary_scene
+from harness.files.pose_files import Poses, write_tum
+from harness.files.records import recording_bytes
 
 from tsgt.analysis.formats import pose_csv, tum_lines, valid_rows
 from tsgt.analysis.formats.trajectories import (

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.pose_files import START_NS, Poses, seconds, write_euroc, write_kitti, write_tum
+from harness.files.pose_files import START_NS, Poses, seconds, write_euroc, write_kitti, write_tum
 
 from tsgt.analysis.formats.trajectories import read_estimates
 from tsgt.errors import InputFileError

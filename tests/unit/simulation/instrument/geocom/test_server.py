@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 import pytest
-from harness.total_stations import SETUP, Bench
+from harness.instruments.total_stations import SETUP, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -1,0 +1,1 @@
+"""Scenarios of the stations' clocks, and what the filters make of them."""

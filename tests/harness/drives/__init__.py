@@ -1,0 +1,1 @@
+"""Motions of a robot and their measurements, without daemons."""

@@ -1,0 +1,1 @@
+"""Drives with an IMU, its devices, its recordings and its faults."""

@@ -1,0 +1,1 @@
+"""Total stations: simulated, scripted, behind a line with faults, or measuring targets."""

@@ -1,0 +1,1 @@
+"""Readers of the stream: browsers, Foxglove, ROS 2, and the network between."""

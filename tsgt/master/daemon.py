@@ -34,7 +34,7 @@ from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
 from tsgt.master.superframe import SuperframeLink
-from tsgt.model import ImuSamples, OdometrySamples
+from tsgt.model import ImuSamples, OdometrySamples, PolarMeasurement
 from tsgt.radio.supervisor import supervise_radio
 from tsgt.recording import (
     EventRecord,
@@ -171,7 +171,7 @@ async def run_master(
                 log.info("stream_event", name=record.event, message=record.message)
                 if alarms is not None:
                     alarms.take(record)
-            recording.put(line)
+            recording.put(line, measurement=isinstance(record, PolarMeasurement))
             if not isinstance(record, ImuSamples | OdometrySamples):  # raw samples are for post-processing
                 server.publish(line)
             dependencies.observe(record, line)

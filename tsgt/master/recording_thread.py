@@ -33,14 +33,11 @@ class RecordingThread:
         self._recorder = recorder
         self._unix_now_ns = unix_now_ns
         self._last_write_ns: int | None = None
+        self.measurement_line = 0
+        """Number of the line of the newest measurement."""
         self._pending = asyncio.Event()
         self._sync_requested = False
         self._sync_done = asyncio.Event()
-
-    @property
-    def line_count(self) -> int:
-        """Lines put so far; the number of the next one."""
-        return self._recorder.line_count
 
     @property
     def error(self) -> RecordingError | None:
@@ -57,14 +54,16 @@ class RecordingThread:
             lost_lines=self._recorder.lost,
         )
 
-    def put(self, line: bytes) -> None:
-        """Queue a line."""
+    def put(self, line: bytes, *, measurement: bool = False) -> None:
+        """Queue a line; ``measurement``: whether it is that of a measurement."""
+        if measurement:
+            self.measurement_line = self._recorder.line_count
         self._recorder.put(line)
         self._pending.set()
 
-    def synced(self, numbers: range) -> bool | None:
-        """Return whether lines are on the disk; False: one is lost, None: one is pending."""
-        return self._recorder.synced(numbers)
+    def synced(self, number: int) -> bool | None:
+        """Return whether a line is on the disk; False: it is lost, None: it is pending."""
+        return self._recorder.synced(number)
 
     async def sync(self, timeout_s: float) -> None:
         """Bring all lines to the disk; wait until that has been tried, or for the timeout, after which it goes on."""

@@ -53,18 +53,11 @@ class Recorder:
         """Lines put so far; the number of the next one."""
         return self._line_count
 
-    def written(self, numbers: range) -> bool | None:
-        """Return whether lines are in the file; False: one is lost, None: one is pending."""
-        return self._are_before(self._written, numbers)
-
-    def synced(self, numbers: range) -> bool | None:
-        """Return whether lines are on the disk, where a power cut leaves them; otherwise as :meth:`written`."""
-        return self._are_before(self._synced, numbers)
-
-    def _are_before(self, count: int, numbers: range) -> bool | None:
-        if any(lost.start < numbers.stop and numbers.start < lost.stop for lost in self._lost_numbers):
+    def synced(self, number: int) -> bool | None:
+        """Return whether a line is on the disk, where a power cut leaves it; False: it is lost, None: it is pending."""
+        if any(number in lost for lost in self._lost_numbers):
             return False
-        return True if numbers.stop <= count else None
+        return True if number < self._synced else None
 
     @property
     def failing(self) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections import deque
+from collections import Counter, deque
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -321,13 +321,15 @@ def stamp_smoothed_poses_now(planting: Planting) -> None:
 def reorder_lines(planting: Planting) -> None:
     """Swap every fiftieth recorded line with the next one."""
     held: dict[Any, bytes] = {}
+    count: Counter[Any] = Counter()
 
     def put(original: Any) -> Any:
-        def defective(disk: Any, line: bytes) -> None:
-            if disk not in held and disk.line_count % 50 == 49:
+        def defective(disk: Any, line: bytes, *, measurement: bool = False) -> None:
+            count[disk] += 1
+            if disk not in held and count[disk] % 50 == 49:
                 held[disk] = line
                 return
-            original(disk, line)
+            original(disk, line, measurement=measurement)
             if disk in held:
                 original(disk, held.pop(disk))
 

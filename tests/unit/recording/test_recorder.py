@@ -87,21 +87,22 @@ def test_hanging_write_has_bounded_memory(disk: FullDisk) -> None:
 
 
 def test_fate_of_a_line_can_be_queried(disk: FullDisk) -> None:
-    """Written, pending or lost, by its number."""
+    """On the disk, pending or lost, by its number."""
     recorder = Recorder(disk, max_pending_lines=2)
     recorder.write_line(b"0")
     disk.full = True
     for number in range(1, 5):
         assert recorder.line_count == number
         recorder.put(b"%d" % number)
-    assert [recorder.written(range(n, n + 1)) for n in range(5)] == [True, None, None, None, None]
+    recorder.sync()
+    assert [recorder.synced(n) for n in range(5)] == [True, None, None, None, None]
     recorder.flush()
-    assert [recorder.written(range(n, n + 1)) for n in range(5)] == [True, False, False, None, None]
+    assert [recorder.synced(n) for n in range(5)] == [True, False, False, None, None]
     disk.full = False
     recorder.flush()
-    assert [recorder.written(range(n, n + 1)) for n in range(5)] == [True, False, False, True, True]
-    assert recorder.written(range(2, 5)) is False
-    assert recorder.written(range(3, 5)) is True
+    assert [recorder.synced(n) for n in range(5)] == [True, False, False, None, None]
+    recorder.sync()
+    assert [recorder.synced(n) for n in range(5)] == [True, False, False, True, True]
 
 
 def test_line_beyond_the_hung_capacity_is_lost(disk: FullDisk) -> None:
@@ -111,4 +112,5 @@ def test_line_beyond_the_hung_capacity_is_lost(disk: FullDisk) -> None:
         recorder.put(b"%d" % number)
     recorder.flush()
     recorder.write_line(b"3")
-    assert [recorder.written(range(n, n + 1)) for n in range(4)] == [True, True, False, True]
+    recorder.sync()
+    assert [recorder.synced(n) for n in range(4)] == [True, True, False, True]

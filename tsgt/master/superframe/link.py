@@ -37,11 +37,11 @@ log = structlog.get_logger()
 
 
 class _Unsynced(NamedTuple):
-    """A measurement, and the recording's lines that came with it: itself, and poses and events that it completes."""
+    """A measurement, and the number of its line in the recording."""
 
     station: int
     sequence: int
-    lines: range
+    line: int
 
 
 class SuperframeLink:
@@ -140,10 +140,8 @@ class SuperframeLink:
         report(link_events.ReplyReceived(station))
         for timed in reply.measurements:
             measurement = self._measurement(station, timed, received_ns)
-            first_line = self._recording.line_count
             report(link_events.MeasurementReceived(measurement))
-            lines = range(first_line, self._recording.line_count)
-            self._unsynced.append(_Unsynced(station, timed.sequence, lines))
+            self._unsynced.append(_Unsynced(station, timed.sequence, self._recording.measurement_line))
             self._hints.measured(measurement)
         if reply.rejected_beacons:
             report(link_events.BeaconTimeRejected(station, reply.rejected_beacons))
@@ -177,7 +175,7 @@ class SuperframeLink:
 
     def _acknowledge(self) -> None:
         """Mark measurements that are on the disk, or lost, for the next acknowledgement: a power cut takes none of them back."""
-        while self._unsynced and (synced := self._recording.synced(self._unsynced[0].lines)) is not None:
+        while self._unsynced and (synced := self._recording.synced(self._unsynced[0].line)) is not None:
             unsynced = self._unsynced.popleft()
             window = self._master.station(unsynced.station).window
             (window.mark_written if synced else window.mark_lost)((unsynced.sequence,))

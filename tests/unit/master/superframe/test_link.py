@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import threading
 from collections import Counter
 from contextlib import asynccontextmanager
+from functools import partial
 from itertools import pairwise
 from statistics import mean, median
 from typing import TYPE_CHECKING
@@ -19,6 +21,7 @@ from harness.missions.field import STATIONS, TRUE, field_of, running
 from structlog.testing import capture_logs
 
 from tsgt.errors import RadioError, RecordingError
+from tsgt.master.publisher import Publisher
 from tsgt.master.replay import replayed
 from tsgt.model import PolarMeasurement, Status
 from tsgt.recording import (
@@ -31,6 +34,7 @@ from tsgt.recording import (
     encode_line,
     read_lines,
 )
+from tsgt.recording.recorder import Recorder
 from tsgt.simulation.lora import LinkModel
 
 if TYPE_CHECKING:
@@ -39,6 +43,7 @@ if TYPE_CHECKING:
 
     from harness.missions.field import Field
 
+    from tsgt.model import Measurement
     from tsgt.radio import Radio, Transmission
 
 MS = 1_000_000
@@ -192,6 +197,40 @@ async def test_unwritten_measurements_are_not_acknowledged(tmp_path: Path) -> No
     assert undelivered(field, until_s=58) == NOTHING
     written = [line.data for line in read_lines(field.recording()) if line.type == "measurement"]
     assert written == [encode_line(m) for m in field.of(PolarMeasurement)]
+
+
+@pytest.mark.parametrize("full_s", [4.7, 4.8, 4.9])
+async def test_lost_line_does_not_repeat_a_measurement(tmp_path: Path, full_s: float) -> None:
+    """A disk that stays full loses the oldest lines; a measurement that it keeps is written once, whatever preceded it."""
+    write_line, publish = RecordingWriter.write_line, Publisher.measurement
+    full = threading.Event()
+
+    def failing(writer: RecordingWriter, line: bytes) -> None:
+        if full.is_set():
+            raise RecordingError("no room", path=tmp_path)
+        write_line(writer, line)
+
+    def after_others(publisher: Publisher, measurement: Measurement) -> None:
+        for _ in range(5):
+            publisher.put(EventRecord(stamp_ns=measurement.received_ns, event="test", message=""))
+        publish(publisher, measurement)
+
+    async with field_of(tmp_path, superframe=True) as field:
+        with (
+            patch.object(RecordingWriter, "write_line", failing),
+            patch.object(Publisher, "measurement", after_others),
+            patch("tsgt.master.daemon.Recorder", partial(Recorder, max_pending_lines=60)),
+        ):
+            async with running(field.master()):
+                await asyncio.sleep(5)
+                full.set()
+                await asyncio.sleep(full_s)
+                full.clear()
+                await asyncio.sleep(4)
+    written = [line.data for line in read_lines(field.recording()) if line.type == "measurement"]
+    stamps = Counter((each["station"], each["stamp_ns"]) for each in map(json.loads, written))
+    assert len(stamps) > 60
+    assert stamps.most_common(1)[0][1] == 1
 
 
 @pytest.mark.slow

@@ -32,7 +32,9 @@ MAX_SAMPLES = 10_000  # an hour and more at the usual rate
 _DROPPED_SAMPLES = 1_000  # how many are dropped at a time
 
 _MAX_UNWRAP_BOUND_US = 30_000.0
-"""The 16 low bits of a time are unambiguous within half of 2^16 us, less a margin for timestamps."""
+"""The 16 low bits of a time are unambiguous within half of 2^16 us, less a margin."""
+_STAMP_BOUND_SIGMAS = 2.0
+"""Of a time stamp of tens of milliseconds: it is uniform over the interval at which the chip was polled, 3.5 sigmas."""
 _WRAP_US = 65_536.0
 _MAX_UNWRAPPED_JUMP_US = 5_000.0
 """An offset that seems to have jumped by more than this may have jumped by 2^16 us more."""
@@ -229,15 +231,18 @@ class BeaconClock:
                 accepted = unambiguous and self._add_initial(weighted, live=live)
         return accepted
 
-    def unwrap(self, received_ns: int, low16: int) -> int | None:
-        """Return the full session time in us of a beacon, from its 16 low bits; None where it is ambiguous."""
+    def unwrap(self, received_ns: int, low16: int, sigma_ns: int) -> int | None:
+        """Return the full session time in us of a beacon, from its 16 low bits; None where it is ambiguous.
+
+        ``sigma_ns``: one sigma of ``received_ns``. Of a reception that was noticed late, by polling, it is tens of milliseconds.
+        """
         if not self.initialised:
             return None
         candidate = self._candidate
         # A single delayed beacon must not keep the next ones from being decoded.
         segment = candidate if candidate and self._candidate_unambiguous else self._segments[-1]
         predicted = _time_in(segment, received_ns)
-        if predicted.bound_us > _MAX_UNWRAP_BOUND_US:
+        if predicted.bound_us + _STAMP_BOUND_SIGMAS * sigma_ns / 1000 > _MAX_UNWRAP_BOUND_US:
             return None
         predicted_us = round(predicted.time_us)
         return predicted_us + (low16 - predicted_us + 0x8000) % 0x10000 - 0x8000

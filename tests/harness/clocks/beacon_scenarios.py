@@ -220,7 +220,9 @@ class _Station:
         """Take a sample, if its session time is unambiguous."""
         every = SESSION_INTERVAL if self._clock.initialised else SESSION_INTERVAL_JOINING
         unambiguous = frame < FULL_TIME_FRAMES or frame % every == 0
-        full_us = sent_us if unambiguous else self._clock.unwrap(received_ns, sent_us & 0xFFFF)
+        full_us = (
+            sent_us if unambiguous else self._clock.unwrap(received_ns, sent_us & 0xFFFF, self._sigma_ns)
+        )
         if full_us is not None:
             self.rejected += not self._clock.add(
                 received_ns, full_us, self._sigma_ns, unambiguous=unambiguous

@@ -35,7 +35,7 @@ def test_without_samples_only_durations_are_known() -> None:
     """There is no time and no unwrapping; a duration is that of the own clock within 120 ppm."""
     clock = BeaconClock()
     assert clock.at(START_NS) is None
-    assert clock.unwrap(START_NS, 5) is None
+    assert clock.unwrap(START_NS, 5, SIGMA_NS) is None
     assert clock.last_received_ns is None
     assert clock.samples == 0
     assert clock.elapsed(START_NS, START_NS + FRAME_NS)[::2] == pytest.approx((400_000.0, 48.0))
@@ -45,7 +45,7 @@ def test_single_sample_gives_no_time() -> None:
     """Its beacon may be delayed by any time, so it does not unwrap the low bits of others either."""
     clock = clock_with(1)
     assert clock.at(received_ns(sent_us(0))) is None
-    assert clock.unwrap(received_ns(sent_us(1)), sent_us(1) & 0xFFFF) is None
+    assert clock.unwrap(received_ns(sent_us(1)), sent_us(1) & 0xFFFF, SIGMA_NS) is None
     assert clock.elapsed(START_NS, START_NS + FRAME_NS)[::2] == pytest.approx((400_000.0, 48.0))
 
 
@@ -74,6 +74,15 @@ def test_two_inconsistent_first_samples_give_no_time() -> None:
         assert at is not None
         assert abs(at.time_us - sent_us(0)) <= at.bound_us
         assert taken.count(False) == 1 + held
+
+
+def test_reception_noticed_late_does_not_unwrap() -> None:
+    """A chip that is polled every 100 ms gives a time within 50 ms: a beacon of 40 ms later has other low bits."""
+    clock = clock_with(150)
+    full = sent_us(150)
+    polled_ns = received_ns(full + 40_000)
+    assert clock.unwrap(polled_ns, full & 0xFFFF, SIGMA_NS) == full + 0x10000  # as if it were exact
+    assert clock.unwrap(polled_ns, full & 0xFFFF, round(100e6 / 12**0.5)) is None
 
 
 def test_ambiguous_samples_give_no_time() -> None:
@@ -133,12 +142,12 @@ def test_low_bits_are_unwrapped() -> None:
     clock = clock_with(150, ppm=50)
     for frames in (1, 2, 250):
         full = sent_us(149 + frames)
-        assert clock.unwrap(received_ns(full, 50), full & 0xFFFF) == full
+        assert clock.unwrap(received_ns(full, 50), full & 0xFFFF, SIGMA_NS) == full
 
 
 def test_low_bits_are_ambiguous_after_a_long_outage() -> None:
     """An hour after the last sample more than one time is possible."""
-    assert clock_with(150).unwrap(received_ns(3.6e9), 0) is None
+    assert clock_with(150).unwrap(received_ns(3.6e9), 0, SIGMA_NS) is None
 
 
 def test_delayed_beacon_is_rejected() -> None:
@@ -179,7 +188,7 @@ def test_long_delayed_beacon_does_not_prevent_unwrapping() -> None:
     """Its sample is 40 ms off; the low bits of the next ones are still unwrapped."""
     clock = clock_with(150)
     clock.add(received_ns(sent_us(150) + 40_000), sent_us(150), SIGMA_NS)
-    assert clock.unwrap(received_ns(sent_us(152)), sent_us(152) & 0xFFFF) == sent_us(152)
+    assert clock.unwrap(received_ns(sent_us(152)), sent_us(152) & 0xFFFF, SIGMA_NS) == sent_us(152)
 
 
 def test_replayed_beacons_never_outvote_the_fit() -> None:
@@ -264,7 +273,7 @@ def test_unwrapping_follows_a_jump_beyond_16_bits() -> None:
     clock, slept_us = clock_with(150), -60_000_000
     for k in range(150, 160):
         local_ns = received_ns(sent_us(k) + slept_us + 60_000_000 * 2)
-        full = sent_us(k) if k == 152 else clock.unwrap(local_ns, sent_us(k) & 0xFFFF)
+        full = sent_us(k) if k == 152 else clock.unwrap(local_ns, sent_us(k) & 0xFFFF, SIGMA_NS)
         if full is not None:
             clock.add(local_ns, full, SIGMA_NS, unambiguous=k == 152)
     at = clock.at(local_ns)

@@ -187,7 +187,7 @@ class StationSession:
         follows = before is not None and before.counter + 1 == self.beacon.counter
         if before is None or not follows or not self.confirmed or not beacon.sent:
             return None
-        sent_us = self._unwrap(before.received_ns, beacon)
+        sent_us = self._unwrap(before, beacon)
         if sent_us is None:
             return None
         return BeaconReception(
@@ -199,11 +199,11 @@ class StationSession:
             boot=self._boot,
         )
 
-    def _unwrap(self, received_ns: int, beacon: Beacon) -> int | None:
+    def _unwrap(self, before: AuthenticBeacon, beacon: Beacon) -> int | None:
         if beacon.session is None:
-            return self.clock.unwrap(received_ns, beacon.sent)
+            return self.clock.unwrap(before.received_ns, beacon.sent, before.sigma_ns)
         sent_us = beacon.session.sent_high << _SENT_BITS | beacon.sent
-        now = self.clock.at(received_ns)
+        now = self.clock.at(before.received_ns)
         if now is None:
             return sent_us
         half = 1 << SESSION_TIME_BITS - 1  # session time wraps after 12.7 days

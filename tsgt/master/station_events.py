@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from tsgt.master.newest_measurement import NO_MEASUREMENT, NewestMeasurement
 from tsgt.model import Status
 from tsgt.recording import LOW_BATTERY_PERCENT, EventRecord
 
@@ -56,7 +57,7 @@ class _Station:
     meaning: str = _MEANING[Status.OK]
     no_distance_since_ns: int | None = None
     """Stamp of the first measurement of angles without a distance; None after any other."""
-    newest: tuple[int, int] = (-1, 0)  # sequence number and stamp of the newest measurement
+    newest: NewestMeasurement = NO_MEASUREMENT
 
 
 class StationEventDetector:
@@ -147,14 +148,14 @@ class StationEventDetector:
         if found is None:
             return []
         events = []
-        late = measurement.sequence < found.newest[0] and measurement.stamp_ns < found.newest[1]
+        late = found.newest.is_newer_than(measurement)
         found.nothing_new_since_ns = None
         if found.idle:
             found.idle = False
             events.append(_event(now_ns, "station_measuring", "measures again", measurement.station))
         if late:  # its status is out of date
             return events
-        found.newest = (measurement.sequence, measurement.stamp_ns)
+        found.newest = NewestMeasurement.of(measurement)
         meaning = _MEANING[measurement.status]
         if measurement.status is not Status.ANGLE_ONLY:
             found.no_distance_since_ns = None

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.estimation import usable
 from tsgt.master.link_events import NO_LINK
+from tsgt.master.newest_measurement import NO_MEASUREMENT, NewestMeasurement
 from tsgt.model import PolarMeasurement, Status
 from tsgt.radio.superframe import UNKNOWN_CONDITION
 from tsgt.recording import StationStatus, StatusRecord
@@ -66,9 +67,8 @@ class Statistics:
         station.measurements += 1
         station.first_ns = station.first_ns or measurement.received_ns
         station.usable += usable(measurement)
-        late = measurement.sequence < station.sequence and measurement.stamp_ns < (station.stamp_ns or 0)
-        if not late:
-            station.sequence = measurement.sequence
+        if not station.newest.is_newer_than(measurement):
+            station.newest = NewestMeasurement.of(measurement)
             station.stamp_ns, station.status = measurement.stamp_ns, measurement.status
             if isinstance(measurement, PolarMeasurement):
                 station.stamp_bound_ns = measurement.stamp_bound_ns
@@ -119,7 +119,7 @@ class _Station:
 
     measurements: int = 0
     usable: int = 0
-    sequence: int = -1
+    newest: NewestMeasurement = NO_MEASUREMENT
     stamp_ns: int | None = None
     stamp_bound_ns: int | None = None
     status: Status | None = None

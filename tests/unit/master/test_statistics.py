@@ -131,6 +131,23 @@ def test_late_measurement_is_counted_but_not_the_newest() -> None:
     assert statistics.status(12 * SECOND).stations[0].status is Status.TILT
 
 
+def test_late_measurement_from_another_journal_is_not_the_newest() -> None:
+    """A client that cannot write its journal takes random numbers far above: they do not tell the order in time."""
+    statistics = Statistics([2])
+    statistics.measurement(MEASUREMENT)
+    statistics.measurement(replace(MEASUREMENT, sequence=3_239_826, stamp_ns=2 * SECOND, status=Status.TILT))
+    station = statistics.status(12 * SECOND).stations[0]
+    assert (station.measurements, station.status, station.age_s) == (2, Status.OK, 2.0)
+
+
+def test_station_whose_clock_was_stepped_back_is_followed() -> None:
+    """Its next measurement has an earlier stamp."""
+    statistics = Statistics([2])
+    statistics.measurement(MEASUREMENT)
+    statistics.measurement(replace(MEASUREMENT, sequence=20_001, stamp_ns=2 * SECOND))
+    assert statistics.status(12 * SECOND).stations[0].age_s == 10.0
+
+
 def test_superframe_state_is_reported() -> None:
     """Nulls until it is known."""
     statistics = Statistics([2])

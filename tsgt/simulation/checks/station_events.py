@@ -30,6 +30,9 @@ LOW_BATTERY_PERCENT, CHARGED_BATTERY_PERCENT = 20, 30
 NO_DISTANCE_NS = 2_000_000_000
 """Angles without a distance are an event if they last this long."""
 
+MAX_SEQUENCE_STEP = 100_000
+"""Numbers of measurements that continue others; a run that could not write its journal has numbers of its own."""
+
 
 def event_failures(master_log: MasterLog, *, superframe: bool) -> Iterator[str]:
     """Yield the stations of which events are missing, or were not called for."""
@@ -52,7 +55,8 @@ def _status_changes(master_log: MasterLog) -> Counter[int]:
         station = measurement.station
         changes[station] += 0
         sequence, stamp_ns = newest.get(station, (-1, 0))
-        if measurement.sequence < sequence and measurement.stamp_ns < stamp_ns:
+        continued = sequence <= measurement.sequence <= sequence + MAX_SEQUENCE_STEP
+        if measurement.stamp_ns < stamp_ns and not continued:
             continue  # a backlog: out of date
         newest[station] = measurement.sequence, measurement.stamp_ns
         if measurement.status is not Status.ANGLE_ONLY:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import Mission
 
 _OTHER_CHANNEL_MHZ: Final = 907.4
-_RESTARTS_S: Final = 4.0  # the restart that takes an edit back ends with the fault
+_RESTART_S: Final = 2.0  # the restart that takes an edit back ends with the fault
 _CONSTANT_MM: Final = 0.3
 _LIDAR: Final = ReferencePointConfig(
     name="lidar", position_m=(0.25, 0.0, 0.62), orientation_xyzw=(0.0, 0.0, 0.0, 1.0)
@@ -44,9 +44,9 @@ def draw_edit(mission: Mission, rng: np.random.Generator) -> MasterEdit:
 
 
 async def _config_edit(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    for_s = max(0.0, fault.duration_s - _RESTARTS_S)
+    until_s = fault.at_s + fault.duration_s - _RESTART_S
     if fault.station is None:
-        await mission.edit_master(draw_edit(mission, rng), for_s)
+        await mission.edit_master(draw_edit(mission, rng), until_s)
         return
     numbers = list(mission.station_logs)
     other = numbers[(numbers.index(fault.station) + 1) % len(numbers)]
@@ -54,7 +54,7 @@ async def _config_edit(mission: Mission, fault: Fault, rng: np.random.Generator)
         SetupMistake(frequency_mhz=_OTHER_CHANNEL_MHZ),
         SetupMistake(prism=mission.prisms[other]),
     ]
-    await mission.make_mistake(fault.station, mistakes[rng.integers(len(mistakes))], for_s)
+    await mission.make_mistake(fault.station, mistakes[rng.integers(len(mistakes))], until_s)
 
 
 async def _master_suspend(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:

@@ -36,7 +36,7 @@ async def _mistake(mission: Mission, fault: Fault, rng: np.random.Generator) -> 
         ),
         FaultKind.PRISM_CONSTANT: SetupMistake(prism_constant_mm=_ROUND_PRISM_MM),
     }
-    await mission.make_mistake(fault.station, mistakes[fault.kind], fault.duration_s)
+    await mission.make_mistake(fault.station, mistakes[fault.kind], fault.at_s + fault.duration_s)
 
 
 async def _second_master(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:

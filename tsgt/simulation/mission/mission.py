@@ -513,23 +513,23 @@ class Mission:
         self._record_crash_window(computer)
         resume()
 
-    async def make_mistake(self, station: int, mistake: SetupMistake, for_s: float) -> None:
-        """Restart a station's client with a mistake in its set-up, and after some time with the right one."""
+    async def make_mistake(self, station: int, mistake: SetupMistake, until_s: float) -> None:
+        """Restart a station's client with a mistake in its set-up, and at a true time in s from the start with the right one."""
         if station in self.mistakes or self._computer(station).is_down:
             return
         self.mistakes[station] = mistake
         await self.restart(station, self.now_s)
-        await asyncio.sleep(for_s)
+        await self.sleep_until(until_s)
         del self.mistakes[station]
         await self.restart(station, self.now_s)
 
-    async def edit_master(self, edit: MasterEdit, for_s: float) -> None:
-        """Restart the master with another configuration, and after some time with its own one."""
+    async def edit_master(self, edit: MasterEdit, until_s: float) -> None:
+        """Restart the master with another configuration, and at a true time in s from the start with its own one."""
         if self.edit is not NO_EDIT or self.computers[MASTER].is_down:
             return
         self.edit = edit
         await self.restart(None, self.now_s)
-        await asyncio.sleep(for_s)
+        await self.sleep_until(until_s)
         self.edit = NO_EDIT
         await self.restart(None, self.now_s)
 

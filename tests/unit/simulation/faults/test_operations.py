@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 from functools import partial
 from typing import TYPE_CHECKING
@@ -39,7 +40,7 @@ def test_edited_pose_rate_is_in_force_from_the_restart_on(tmp_path: Path) -> Non
 
     async def edit(mission: Mission) -> None:
         await mission.sleep_until(8.0)
-        await mission.edit_master(MasterEdit(pipeline={"rate_hz": 5.0}), 10.0)
+        await mission.edit_master(MasterEdit(pipeline={"rate_hz": 5.0}), 20.0)
 
     result = run_linear_drive(tmp_path, edit, 32.0)
     assert check_invariants(result) == []
@@ -64,9 +65,9 @@ def test_station_missing_in_the_master_and_wrong_channel_lose_nothing(tmp_path: 
 
     async def edit(mission: Mission) -> None:
         await mission.sleep_until(6.0)
-        await mission.edit_master(MasterEdit(without_station=2), 6.0)
+        await mission.edit_master(MasterEdit(without_station=2), 14.0)
         await mission.sleep_until(22.0)
-        await mission.edit_master(MasterEdit(frequency_mhz=907.4), 8.0)
+        await mission.edit_master(MasterEdit(frequency_mhz=907.4), 32.0)
 
     result = run_linear_drive(tmp_path, edit, 50.0)
     assert check_invariants(result, replay=False) == []
@@ -80,12 +81,29 @@ def test_client_on_another_channel_or_prism_loses_nothing(tmp_path: Path) -> Non
 
     async def edit(mission: Mission) -> None:
         await mission.sleep_until(6.0)
-        await mission.make_mistake(1, SetupMistake(frequency_mhz=907.4), 8.0)
-        await mission.make_mistake(3, SetupMistake(prism=1), 8.0)
+        await mission.make_mistake(1, SetupMistake(frequency_mhz=907.4), 16.0)
+        await mission.make_mistake(3, SetupMistake(prism=1), 28.0)
 
     result = run_linear_drive(tmp_path, edit, 50.0)
     assert check_invariants(result, replay=False) == []
     assert max(_missing(result).values()) <= 3
+
+
+@pytest.mark.slow
+def test_mistake_that_begins_late_ends_in_time(tmp_path: Path) -> None:
+    """A suspended computer delays the restart that brings it: it must not last beyond the faults for that."""
+    ends_s: list[float] = []
+
+    async def edit(mission: Mission) -> None:
+        await mission.sleep_until(4.0)
+        suspension = asyncio.create_task(mission.suspend(1, 8.0))
+        await asyncio.sleep(0.1)
+        await mission.make_mistake(1, SetupMistake(frequency_mhz=907.4), 10.0)
+        ends_s.append(mission.now_s)
+        await suspension
+
+    run_linear_drive(tmp_path, edit, 20.0)
+    assert 12.0 < ends_s[0] < 18.0  # two restarts after the suspension
 
 
 @pytest.mark.slow

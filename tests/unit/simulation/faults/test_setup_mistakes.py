@@ -32,8 +32,8 @@ def test_client_with_another_key_or_number(tmp_path: Path) -> None:
     async def mistakes(mission: Mission) -> None:
         await mission.sleep_until(8.0)
         await asyncio.gather(
-            mission.make_mistake(1, SetupMistake(key=b"another1" * 4), 34.0),
-            mission.make_mistake(2, SetupMistake(station=9), 34.0),
+            mission.make_mistake(1, SetupMistake(key=b"another1" * 4), 44.0),
+            mission.make_mistake(2, SetupMistake(station=9), 44.0),
         )
 
     with capture_logs() as logs:

@@ -29,6 +29,9 @@ KICK_M: Final = (0.001, 0.050)
 KICK_RAD: Final = (0.0001, 0.005)
 
 _STEP_S = 1.0  # of slow movements
+_RESOLUTION_S = (
+    1e-6  # virtual time has whole nanoseconds, so that the rest of a duration may be too short to pass
+)
 _SUN_TILT_RADPS = 10e-6 / 60  # within the compensator's range for hours
 _LEVEL_RAD = 0.3e-3  # tilt of a tripod that was levelled by its bubble
 _BEYOND_COMPENSATOR_RAD = 3e-3
@@ -46,7 +49,7 @@ _ROLLED_BACK_S = 1.0  # lies at least that long
 
 async def _sink(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     sink_mps = SINK_MPS * SINK_FACTOR ** rng.random()
-    while (left_s := fault.at_s + fault.duration_s - mission.now_s) > 0:
+    while (left_s := fault.at_s + fault.duration_s - mission.now_s) > _RESOLUTION_S:
         await asyncio.sleep(step_s := min(_STEP_S, left_s))
         mission.move_station(_station(fault), (0.0, 0.0, -sink_mps * step_s), 0.0)
 
@@ -56,7 +59,7 @@ async def _sun(mission: Mission, fault: Fault, rng: np.random.Generator) -> None
     direction_rad = rng.uniform(0.0, math.tau)
     tilt_radps = _SUN_TILT_RADPS * math.cos(direction_rad), _SUN_TILT_RADPS * math.sin(direction_rad)
     instrument = mission.instruments[_station(fault)]
-    while (left_s := fault.at_s + fault.duration_s - mission.now_s) > 0:
+    while (left_s := fault.at_s + fault.duration_s - mission.now_s) > _RESOLUTION_S:
         await asyncio.sleep(step_s := min(_STEP_S, left_s))
         across, along = instrument.tilt_rad
         instrument.tilt_rad = across + tilt_radps[0] * step_s, along + tilt_radps[1] * step_s

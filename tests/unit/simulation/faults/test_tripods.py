@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 STATION, AT_S, DURATION_S = 2, 1.0, 40.0
 
 
-def _inject(folder: Path, kind: FaultKind, seed: int) -> tuple[Mission, list[float]]:
+def _inject(
+    folder: Path, kind: FaultKind, seed: int, duration_s: float = DURATION_S
+) -> tuple[Mission, list[float]]:
     """Inject one fault into a mission without daemons; return it, and its instrument's tilt in every second."""
     timeline = VirtualTimeline()
     tilts_rad: list[float] = []
@@ -41,7 +43,7 @@ def _inject(folder: Path, kind: FaultKind, seed: int) -> tuple[Mission, list[flo
                 second * 10**9 + 500_000_000,
                 lambda: tilts_rad.append(math.hypot(*instrument.tilt_rad)),
             )
-        await inject_fault(mission, Fault(AT_S, kind, STATION, DURATION_S, seed))
+        await inject_fault(mission, Fault(AT_S, kind, STATION, duration_s, seed))
         await mission.sleep_until(50.0)
         return mission
 
@@ -59,6 +61,13 @@ def _displacement(mission: Mission) -> tuple[NDArray[np.float64], float]:
     turn = before[:3, :3].T @ after[:3, :3]
     assert turn[2, 2] == pytest.approx(1.0)  # it is level
     return after[:3, 3] - before[:3, 3], math.atan2(turn[1, 0], turn[0, 0])
+
+
+@pytest.mark.parametrize("kind", [FaultKind.TRIPOD_SINK, FaultKind.TRIPOD_SUN])
+def test_slow_movement_of_a_fraction_of_a_nanosecond_ends(tmp_path: Path, kind: FaultKind) -> None:
+    """A duration as it is drawn is no whole number of nanoseconds."""
+    mission, _ = _inject(tmp_path, kind, 1, DURATION_S + 0.3e-9)
+    assert len(mission.moves) == DURATION_S  # a step per second
 
 
 @pytest.mark.parametrize("seed", [1, 2])

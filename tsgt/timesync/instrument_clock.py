@@ -52,6 +52,10 @@ _MIN_TIMED = 20
 this many in succession the instrument has become slower. Then a sample bounds the envelope, but does not count in the fit:
 delays that grow would pass for a skew. The average is known from this many exchanges on."""
 
+_FASTER_TOLERANCE_NS = 5e6
+"""A sample below the others is one of a faster response, and no corrupted one, if its exchange took less than theirs by as much,
+within this."""
+
 _CANDIDATES = 3
 _CANDIDATE_SPREAD_NS = 100e6
 _CANDIDATE_WINDOW = 32
@@ -64,6 +68,20 @@ class HostTime(NamedTuple):
     host_ns: int
     sigma_ns: int
     bound_ns: int
+
+
+@dataclass(slots=True)
+class _Sample:
+    """The time of a response before initialisation."""
+
+    instrument_ms: int
+    arrived_ns: int
+    took_ns: int | None  # from the request to the arrival; None: unknown
+
+    @property
+    def offset_ns(self) -> int:
+        """Arrival less instrument time."""
+        return self.arrived_ns - self.instrument_ms * 1_000_000
 
 
 @dataclass(slots=True)
@@ -100,7 +118,7 @@ class InstrumentClock:
         self.inconsistent = False
         self._reset([])
 
-    def _reset(self, samples: list[tuple[int, int]]) -> None:
+    def _reset(self, samples: list[_Sample]) -> None:
         self._initial = samples
         self._bins: deque[_Bin] = deque()
         self._x0 = self._y0 = 0
@@ -148,13 +166,13 @@ class InstrumentClock:
         self._seen += 1
         self.inconsistent = False
         if not self.initialised:
-            self._initial.append((instrument_ms, arrived_ns))
+            self._initial.append(_Sample(instrument_ms, arrived_ns, took_ns))
             if len(self._initial) >= MIN_SAMPLES:
                 self._initialise()
             return True
         x, y = self._coordinates(instrument_ms, arrived_ns)
         delay = y - self._height - self._skew * x
-        if not -self._gate(x) <= delay <= MAX_DELAY_NS:
+        if not -self._gate(x) - self._faster_by(took_ns) <= delay <= MAX_DELAY_NS:
             return self._add_inconsistent(instrument_ms, arrived_ns)
         new_bin = self._put(x, y, took_ns)
         below = y < self._height + self._skew * x
@@ -199,36 +217,36 @@ class InstrumentClock:
 
     def _initialise(self) -> None:
         """Fit the first samples, without outliers among them: a corrupted one, or a jump in between."""
-        offsets = [arrived_ns - ms * 1_000_000 for ms, arrived_ns in self._initial]
-        middle = median(offsets)
-        kept = [
-            sample
-            for sample, y in sorted(zip(self._initial, offsets, strict=True), key=lambda pair: pair[1])
-            if abs(y - middle) <= MAX_DELAY_NS
-        ]
-        if len(kept) > 2:
-            lowest, second = (arrived - ms * 1_000_000 for ms, arrived in kept[:2])
-            if second - lowest > max(5e6, 4 * (middle - second)):
-                del kept[0]
+        middle = median([each.offset_ns for each in self._initial])
+        kept = [each for each in self._initial if abs(each.offset_ns - middle) <= MAX_DELAY_NS]
+        kept.sort(key=lambda each: each.offset_ns)
+        if len(kept) > 2 and _is_corrupted(kept[0], kept[1], middle):
+            del kept[0]
         if len(kept) < MIN_SAMPLES - 1:
             # Drop the oldest, whichever it is: most samples may be from before a power cycle.
             del self._initial[0]
             return
-        kept.sort()
-        self._x0 = kept[0][0] * 1_000_000
-        self._y0 = kept[0][1] - self._x0
+        kept.sort(key=lambda each: each.instrument_ms)
+        self._x0 = kept[0].instrument_ms * 1_000_000
+        self._y0 = kept[0].arrived_ns - self._x0
         self._skew = self._known_skew
-        heights = [self._coordinates(*sample)[1] for sample in kept]
+        points = [self._coordinates(each.instrument_ms, each.arrived_ns) for each in kept]
+        heights = [y for _, y in points]
         self._height = min(heights)
         self._mean_delay = median(heights) - self._height
-        for ms, arrived_ns in kept:
-            self._put(*self._coordinates(ms, arrived_ns))
+        for (x, y), each in zip(points, kept, strict=True):
+            self._put(x, y, each.took_ns)
         self._initial = []
         self._fit()
 
     def _gate(self, x: float) -> float:
         """Return how far below the envelope a sample may lie and still be a faster response, in ns."""
         return _RESOLUTION_NS + 10 * self._excess + 3 * self._skew_sigma * abs(x - self._pivot)
+
+    def _faster_by(self, took_ns: int | None) -> float:
+        """Return by how much an exchange was faster than all before."""
+        fastest = min([bin_.min_took for bin_ in self._bins], default=math.inf)
+        return 0.0 if took_ns is None or math.isinf(fastest) else max(fastest - took_ns, 0.0)
 
     def _put(self, x: float, y: float, took_ns: int | None = None) -> bool:
         """Put a sample into its bin; return whether it starts a new one."""
@@ -279,8 +297,8 @@ class InstrumentClock:
         recent = self._candidates[-1][0] - self._candidates[0][0] <= _CANDIDATE_WINDOW
         if len(offsets) < _CANDIDATES or not recent or max(offsets) - min(offsets) > _CANDIDATE_SPREAD_NS:
             return True
-        agreeing = [(ms, arrived) for _, ms, arrived in self._candidates]
-        points = [self._coordinates(*sample) for sample in agreeing]
+        agreeing = [_Sample(ms, arrived, None) for _, ms, arrived in self._candidates]
+        points = [self._coordinates(each.instrument_ms, each.arrived_ns) for each in agreeing]
         self.inconsistent = False
         if all(abs(y - self._height - self._skew * x) <= MAX_DELAY_NS / 2 for x, y in points):
             # The minimum delay or the skew has changed: the old envelope is void, the origin stays.
@@ -328,6 +346,18 @@ class InstrumentClock:
         self._lift = line.height - self._height + (truncation - lowest.mean) * _RESOLUTION_NS
         self._excess = 2 * self._mean_delay / self._counted
         rounding_ns = _ROUNDING_NS if self._whole_ms else 0.0
-        self._sigma = math.hypot(rounding_ns, lowest.sigma * _RESOLUTION_NS, line.pivot_sigma)
+        # The spread is known from as many responses only: as with Student's distribution, less one for the lowest.
+        few = max(self._counted - 1, 1) / max(self._counted - 3, 1)
+        self._sigma = math.hypot(rounding_ns, few * lowest.sigma * _RESOLUTION_NS, line.pivot_sigma)
         self._pivot = line.pivot
         self._fitted = self._samples
+
+
+def _is_corrupted(lowest: _Sample, second: _Sample, middle_ns: float) -> bool:
+    """Whether the lowest sample of the first ones is too far below the second one for a response that was only faster."""
+    below_ns = second.offset_ns - lowest.offset_ns
+    if below_ns <= max(_FASTER_TOLERANCE_NS, 4 * (middle_ns - second.offset_ns)):
+        return False
+    if lowest.took_ns is None or second.took_ns is None:
+        return True
+    return second.took_ns - lowest.took_ns < below_ns - _FASTER_TOLERANCE_NS

@@ -122,6 +122,50 @@ def test_corrupted_time_during_initialisation_is_rejected(wrong_ms: int, which: 
     assert abs(time.host_ns - arrived_ns(60_000)) < 10 * MS
 
 
+def test_faster_response_during_initialisation_counts() -> None:
+    """Of the first eight one is fastest, and the others happen to be alike: it is no corrupted one, its exchange was as fast."""
+    clock = InstrumentClock()
+    for number, late_ms in enumerate([15.0, 15.2, 14.9, 7.9, 31.4, 17.8, 15.7, 16.1]):
+        ms = 1000 + 50 * number
+        clock.add(ms, arrived_ns(ms, late_ms), round((22.0 + late_ms) * MS))
+    time = clock.at(1400)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(1400)) < 3 * time.sigma_ns
+
+
+@pytest.mark.parametrize("samples", [MIN_SAMPLES, 12, 24])
+def test_first_times_are_as_uncertain_as_they_say(samples: int) -> None:
+    """Over 300 starts of an instrument that responds within 20 to 60 ms; the spread of its delays is not known before."""
+    rng = np.random.default_rng(3)
+    errors = []
+    for _ in range(300):
+        clock = InstrumentClock()
+        for number in range(samples):
+            ms = 1000.3 + 60 * number
+            late_ms = float(rng.uniform(0, 40))
+            clock.add(int(ms), arrived_ns(ms, late_ms), round((22 + late_ms + rng.normal(0, 0.5)) * MS))
+        time = clock.at(int(ms))
+        assert time is not None
+        errors.append((time.host_ns - arrived_ns(ms)) / time.sigma_ns)
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.2
+    assert np.count_nonzero(np.abs(errors) > 6) <= 2
+
+
+def test_faster_response_lowers_the_envelope_at_once() -> None:
+    """Eight responses happened to be alike; the next one is far below, and its exchange took as much less."""
+    clock = InstrumentClock()
+    for number in range(MIN_SAMPLES):
+        ms = 1000 + 50 * number
+        clock.add(ms, arrived_ns(ms, 15.0 + 0.1 * number), round((37.0 + 0.1 * number) * MS))
+    clock.add(1500, arrived_ns(1500, 0.5), 36_000_000)  # as slow as the others: the time in it is corrupted
+    assert clock.inconsistent
+    clock.add(1600, arrived_ns(1600, 0.5), 22_500_000)
+    assert not clock.inconsistent
+    time = clock.at(1600)
+    assert time is not None
+    assert abs(time.host_ns - arrived_ns(1600)) < 3 * MS
+
+
 @pytest.mark.parametrize("before", range(1, MIN_SAMPLES))
 def test_power_cycle_during_initialisation(before: int) -> None:
     """The samples after the power cycle define the fit, however many came before."""

@@ -17,7 +17,7 @@ import structlog
 
 import tsgt
 from tsgt import service
-from tsgt.clock import SuspensionWatch, UnixTimeline, first_suspension, suspended_ns
+from tsgt.clock import SuspensionWatch, UnixTimeline, suspended_ns
 from tsgt.config import ClassicMasterConfig
 from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError, StreamError
 from tsgt.imu import Imu, WheelOdometry
@@ -107,16 +107,13 @@ async def run_through_suspensions(
     """
     suspended: ComputerSuspendedError | None = None
     while True:
-        try:
-            await run_master(config, parameters, settings, dependencies, suspended)
-        except* ComputerSuspendedError as errors:
-            suspended = first_suspension(errors)
-            log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
-            if dependencies.read_setup is not None:
-                with suppress(
-                    ConfigError
-                ):  # a file that is being edited: those in force before the suspension remain
-                    parameters = dependencies.read_setup()
+        suspended = await service.until_suspended(
+            run_master(config, parameters, settings, dependencies, suspended)
+        )
+        log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
+        if dependencies.read_setup is not None:
+            with suppress(ConfigError):  # a file that is being edited: those in force before remain
+                parameters = dependencies.read_setup()
 
 
 async def run_master(

@@ -12,6 +12,7 @@ from tsgt.service.daemon import (
     run,
     sd_notify,
     sync_periodically,
+    until_suspended,
     watchdog_interval_s,
 )
 from tsgt.service.log_limiter import LogLimiter
@@ -36,5 +37,6 @@ __all__ = [
     "sd_notify",
     "start_process",
     "sync_periodically",
+    "until_suspended",
     "watchdog_interval_s",
 ]

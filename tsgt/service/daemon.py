@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 import structlog
 
-from tsgt.errors import StreamError, TsgtError
+from tsgt.clock import first_suspension
+from tsgt.errors import ComputerSuspendedError, StreamError, TsgtError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable, Coroutine, Iterator
     from pathlib import Path
 
     from tsgt.clock import Clock
@@ -36,6 +37,29 @@ _FOLDER_LOCK_TIMEOUT_S = 1.0
 """Another program that opens a socket in the same folder holds the lock for a millisecond."""
 
 log = structlog.get_logger()
+
+
+async def until_suspended(main: Coroutine[None, None, None]) -> ComputerSuspendedError:
+    """Run a daemon until it notices that the computer was suspended; return for how long. Raises its other errors.
+
+    It has a task of its own: an error of a task group takes the place of a cancellation at the same time, and a daemon that is stopped
+    just then would go on.
+    """
+    task = asyncio.create_task(main)
+    cancelled = False
+    try:
+        await asyncio.wait([task])
+    except asyncio.CancelledError:
+        cancelled = True
+        task.cancel()
+    found: BaseExceptionGroup[ComputerSuspendedError] | None = None
+    try:
+        await task
+    except* ComputerSuspendedError as errors:
+        found = errors
+    if cancelled or found is None:
+        raise asyncio.CancelledError
+    return first_suspension(found)
 
 
 def run(main: Callable[[], Awaitable[T]]) -> T:

@@ -12,8 +12,8 @@ import structlog
 
 import tsgt
 from tsgt import service
-from tsgt.clock import SuspensionWatch, UnixTimeline, first_suspension
-from tsgt.errors import ComputerSuspendedError, RecordingError
+from tsgt.clock import SuspensionWatch, UnixTimeline
+from tsgt.errors import RecordingError
 from tsgt.radio import Command, MeasureCommand
 from tsgt.radio.superframe import UNKNOWN_CONDITION, InstrumentCondition, InstrumentState
 from tsgt.radio.supervisor import supervise_radio
@@ -54,12 +54,11 @@ async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies:
     """
     while True:
         watch = SuspensionWatch(dependencies.suspended_ns)
-        try:
-            await _run_until_suspended(
-                config, settings, replace(dependencies, boot=watch.boot(dependencies.boot)), watch
-            )
-        except* ComputerSuspendedError as errors:
-            log.warning("computer_resumed", for_s=round(first_suspension(errors).for_s, 3))
+        run = _run_until_suspended(
+            config, settings, replace(dependencies, boot=watch.boot(dependencies.boot)), watch
+        )
+        suspended = await service.until_suspended(run)
+        log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
 
 
 async def _run_until_suspended(

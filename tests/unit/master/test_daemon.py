@@ -21,7 +21,7 @@ from harness.instruments.bridge import FakeStart
 from harness.missions.field import DISK, STATIONS, TRUE, field_of, running
 
 from tsgt.config import AlarmsConfig, GeofenceConfig, ImuConfig
-from tsgt.errors import ConfigError, RadioError
+from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.geofence import run_geofence_command
 from tsgt.master.reload import RELOAD_SIGNAL
@@ -224,6 +224,24 @@ async def test_recording_equals_stream_and_replay(tmp_path: Path, protocol: dict
     assert [line.data for line in lines[2:]] == streamed
     assert [line for _, some in replayed(field.recording()) for line in some] == streamed
     assert {"geofence_exited", "geofence_entered", "station_lost 3"} <= set(events(field))
+
+
+async def test_master_that_is_stopped_as_its_computer_resumes_ends(tmp_path: Path) -> None:
+    """Both at once: the error of the resume takes the place of the cancellation."""
+
+    async def resumed(*_: object) -> None:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            raise ExceptionGroup("", [ComputerSuspendedError(1.0)]) from None
+
+    async with field_of(tmp_path, DRIVING) as field:
+        with patch("tsgt.master.daemon.run_master", resumed):
+            task = asyncio.create_task(field.master(suspended_ns=lambda: 0))
+            await asyncio.sleep(0.1)
+            task.cancel()
+            await asyncio.wait([task], timeout=1.0)
+    assert task.cancelled()
 
 
 async def test_suspended_master_begins_anew(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 import threading
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
 
 import pytest
 from harness.hardware.radios import PAPER
@@ -15,7 +16,7 @@ from harness.radio.client import OFFSET_NS, SCENARIO, START_NS, client_config, f
 from structlog.testing import capture_logs
 
 from tsgt.config.scenario import StatusFaultConfig
-from tsgt.errors import RadioError, RecordingError, StreamError
+from tsgt.errors import ComputerSuspendedError, RadioError, RecordingError, StreamError
 from tsgt.model import Status
 from tsgt.radio.classic import MeasurementMessage
 from tsgt.radio.classic.messages import Acknowledgement, PingReply, TimeReply
@@ -347,3 +348,24 @@ async def client_status(path: Path) -> dict[str, Any]:
     status = json.loads(line)
     assert isinstance(status, dict)
     return status
+
+
+async def test_client_that_is_stopped_as_its_computer_resumes_ends(tmp_path: Path) -> None:
+    """Both at once: the error of the resume takes the place of the cancellation."""
+
+    async def resumed(*_: object) -> None:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            raise ExceptionGroup("", [ComputerSuspendedError(1.0)]) from None
+
+    async with field_day(tmp_path) as day:
+        dependencies = ClientDependencies(
+            instrument=ScriptedInstrument(day.clock), open_radio=day.open_radio, clock=day.clock
+        )
+        with patch("tsgt.station.daemon._run_until_suspended", resumed):
+            task = asyncio.create_task(run_client(client_config(tmp_path), PAPER, dependencies))
+            await asyncio.sleep(0.1)
+            task.cancel()
+            await asyncio.wait([task], timeout=1.0)
+    assert task.cancelled()

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.clock import first_suspension
+from tsgt import service
 from tsgt.config import SuperframeMasterConfig, level_frame, scenario_parameters
-from tsgt.errors import ComputerSuspendedError
 from tsgt.estimation import start_now
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
     from tsgt.config import ScenarioConfig, SimulatedStation
+    from tsgt.errors import ComputerSuspendedError
     from tsgt.radio import RadioOpener
     from tsgt.simulation.imu import ImuCondition, SimulatedImuRun
     from tsgt.simulation.kernel import Timeline
@@ -294,10 +294,7 @@ class Mission:
     async def _through_suspensions(self, master: Coroutine[None, None, None]) -> None:
         """Run the master, and after each suspension another one, as :func:`~tsgt.master.daemon.run_through_suspensions` does."""
         while True:
-            try:
-                await master
-            except* ComputerSuspendedError as errors:
-                master = self._new_master(first_suspension(errors))
+            master = self._new_master(await service.until_suspended(master))
 
     async def run_second_master(self, for_s: float) -> None:
         """Run another master with the same key, stations and set-up beside the robot's, and then stop it."""

@@ -105,7 +105,9 @@ class Mission:
         continuous = 1.0 if stations < STATIONS else 0.25 if imu == "none" else 0.75
         protocol: Literal["superframe", "classic"] = "superframe" if rng.random() < 0.5 else "classic"
         estimator: Literal["linear", "continuous"] = "continuous" if rng.random() < continuous else "linear"
-        named = np.random.default_rng([seed, 0xF1E1D]).choice(FIELD_DAY_KINDS, FIELD_DAY_COUNT, replace=False)
+        # A master with an IMU cannot be suspended in the simulation.
+        named = [kind for kind in FIELD_DAY_KINDS if imu == "none" or kind != FaultKind.MASTER_SUSPEND]
+        named = np.random.default_rng([seed, 0xF1E1D]).choice(named, FIELD_DAY_COUNT, replace=False).tolist()
         return cls(
             seed,
             protocol,

@@ -112,9 +112,10 @@ def early_delay(count: int, seed: int) -> tuple[float, float]:
         sent_us = round(true_us + rng.normal(0.0, jitter_us))
         every = SESSION_INTERVAL if clock.initialised else SESSION_INTERVAL_JOINING
         unambiguous = frame < FULL_TIME_FRAMES or frame % every == 0
-        full_us = sent_us if unambiguous else clock.unwrap(received_ns, sent_us & 0xFFFF)
+        sigma_ns = round(1000 * jitter_us)
+        full_us = sent_us if unambiguous else clock.unwrap(received_ns, sent_us & 0xFFFF, sigma_ns)
         if full_us is not None:
-            clock.add(received_ns, full_us, round(1000 * jitter_us), unambiguous=unambiguous)
+            clock.add(received_ns, full_us, sigma_ns, unambiguous=unambiguous)
         for before_s in (-0.2, 0.3, 1.0, 2.0, 4.0, 8.0, 20.0) if clock.converged else ():
             asked_us = true_us - 1e6 * before_s
             found = clock.at(10**12 + round(1000 * skew * asked_us))

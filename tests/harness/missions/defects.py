@@ -184,7 +184,7 @@ def reverse_frequency(planting: Planting) -> None:
     """Extrapolate a clock offset with the wrong sign of the frequency."""
 
     def at_ns(line: Any, station_ns: int) -> int:
-        return int(line.base_ns + round(line.offset_ns - line.frequency * line._seconds(station_ns)))
+        return int(line.base_ns + round(line.line.offset - line.line.skew * line._seconds(station_ns)))
 
     planting.replace_attribute(RegressionLine, "at_ns", lambda _: at_ns)
 

@@ -9,12 +9,13 @@ import numpy as np
 from tsgt.estimation import usable
 from tsgt.model import MIN_PRISMS
 from tsgt.simulation.checks.poses import apparent_poses
+from tsgt.simulation.checks.poses.late_stamps import stamps_are_late
 from tsgt.simulation.faults import FaultKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from tsgt.simulation.mission import JournalIndex, MissionResult
+    from tsgt.simulation.mission import JournalIndex, MasterLog, MissionResult
 
 RECOVERY_TIME_S = 10.0
 """Rates are measured from this time after the last fault."""
@@ -74,7 +75,10 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
     ) / 1e9
     valid = np.count_nonzero((from_s <= at_s) & (at_s < to_s))
     min_valid_share = pose_share(
-        protocol, stations=len(result.parameters.stations), knocked=FaultKind.IMU_KNOCK in result.faults
+        protocol,
+        stations=len(result.parameters.stations),
+        knocked=FaultKind.IMU_KNOCK in result.faults,
+        contradicted=_contradicted_by_late_stamps(master_log, indices),
     )
     expected = seconds * 1e9 / result.parameters.pipeline.period_ns
     misfit_m = apparent_poses(result, master_log, np.arange(from_s, to_s)).misfit_m
@@ -87,9 +91,19 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
         )
 
 
-def pose_share(protocol: str, *, stations: int, knocked: bool) -> float:
+def pose_share(protocol: str, *, stations: int, knocked: bool, contradicted: bool) -> float:
     """Minimum share of valid poses.
 
-    An IMU that was knocked is set up wrongly for good. Fewer than three stations have no poses without it.
+    An IMU that was knocked is set up wrongly for good. Fewer than three stations have no poses without it. A station with late stamps
+    contradicts the IMU as one that has moved: ``contradicted``, also for good.
     """
-    return 0.0 if knocked and stations < MIN_PRISMS else MIN_VALID_SHARE[protocol]
+    return 0.0 if (knocked or contradicted) and stations < MIN_PRISMS else MIN_VALID_SHARE[protocol]
+
+
+def _contradicted_by_late_stamps(master_log: MasterLog, indices: Mapping[int, JournalIndex]) -> bool:
+    """Whether measurements were said to contradict the IMU while a station's stamps were late."""
+    return any(
+        stamps_are_late(indices.values(), (event.stamp_ns - master_log.unix_at_zero_ns) / 1e9)
+        for event in master_log.events
+        if event.event == "station_contradicted"
+    )

@@ -47,6 +47,11 @@ def late_stamp_tolerances(
     return tolerances
 
 
+def stamps_are_late(indices: Iterable[JournalIndex], at_s: float) -> bool:
+    """Whether a station's stamps are late at a true time."""
+    return any(from_s <= at_s < to_s for index in indices for from_s, to_s, _ in _late_stamps(index))
+
+
 def _late_stamps(index: JournalIndex) -> Iterator[tuple[float, float, float]]:
     """Yield begin, end and delay of the stamps of each client that began while its instrument was slower, in s."""
     reported = index.station_log.reported_distances

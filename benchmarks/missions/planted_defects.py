@@ -274,7 +274,7 @@ DEFECTS: Final = {
     "layout-event": Defect(
         "a tripod that was turned is no event", defects_published.report_no_layout, script=turned_tripod
     ),
-    "outstanding": Defect(
+    "nothing-outstanding": Defect(
         "nothing is outstanding by the status",
         defects_published.state_nothing_outstanding,
         script=silent_station,

@@ -18,9 +18,9 @@ class NewestMeasurement(NamedTuple):
     stamp_ns: int
 
     def is_newer_than(self, measurement: Measurement) -> bool:
-        """Whether a measurement is from before this one.
+        """Whether a measurement was made before this one: its stamp is earlier, and its number does not continue this one's.
 
-        With a later stamp none is. With an earlier one it is, unless it continues the numbers: then the station's clock was stepped.
+        One that continues the numbers is newer; an earlier stamp then means that the station's clock was stepped.
         """
         step = measurement.sequence - self.sequence
         return measurement.stamp_ns < self.stamp_ns and not 0 <= step <= MAX_SEQUENCE_STEP

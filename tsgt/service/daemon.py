@@ -57,8 +57,9 @@ async def until_suspended(main: Coroutine[None, None, None]) -> ComputerSuspende
         await task
     except* ComputerSuspendedError as errors:
         found = errors
-    if cancelled or found is None:
+    if cancelled:
         raise asyncio.CancelledError
+    assert found is not None  # noqa: S101 (a daemon runs for ever)
     return first_suspension(found)
 
 

@@ -244,9 +244,13 @@ class InstrumentClock:
         return _RESOLUTION_NS + 10 * self._excess + 3 * self._skew_sigma * abs(x - self._pivot)
 
     def _faster_by(self, took_ns: int | None) -> float:
-        """Return by how much an exchange was faster than all before."""
-        fastest = min([bin_.min_took for bin_ in self._bins], default=math.inf)
+        """Return by how much an exchange was faster than all before, in ns; 0 where unknown."""
+        fastest = self._fastest_exchange()
         return 0.0 if took_ns is None or math.isinf(fastest) else max(fastest - took_ns, 0.0)
+
+    def _fastest_exchange(self) -> float:
+        """Return how long the fastest exchange of the window took, in ns; infinite if none is known."""
+        return min([bin_.min_took for bin_ in self._bins], default=math.inf)
 
     def _put(self, x: float, y: float, took_ns: int | None = None) -> bool:
         """Put a sample into its bin; return whether it starts a new one."""
@@ -286,7 +290,7 @@ class InstrumentClock:
         if timed < _MIN_TIMED:
             return False
         mean = sum([bin_.sum_took for bin_ in self._bins]) / timed
-        fastest = min([bin_.min_took for bin_ in self._bins])
+        fastest = self._fastest_exchange()
         return took_ns > fastest + _SLOW_SHARE * (mean - fastest)
 
     def _add_inconsistent(self, instrument_ms: int, arrived_ns: int) -> bool:

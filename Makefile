@@ -8,9 +8,9 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 
 # Property tests of everything that takes bytes from outside.
-FUZZED := $(addprefix tests/property/test_,$(addsuffix .py,air bridge classic client damaged_files damaged_recordings \
-	damaged_replies forgery geocom gnss_files hostile_radio hostile_sockets radio recording \
-	superframe_messages tum))
+FUZZED := $(addprefix tests/property/,$(addsuffix .py,$(addprefix daemons/test_,bridge client damaged_replies geocom hostile_sockets) \
+	$(addprefix files/test_,damaged_files damaged_recordings gnss_files recording tum) \
+	$(addprefix radio/test_,air classic forgery hostile_radio radio superframe_messages)))
 
 .PHONY: demo bundle test test-all lint types layers fast-tests all-tests test-libs pi-libs test-vm ros2 docs fuzz soak bench generated format clean
 

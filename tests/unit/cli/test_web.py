@@ -1,4 +1,4 @@
-"""``tsgt web``: its options. The page itself is tested in unit/web and process/test_web.py."""
+"""``tsgt web``: its options. The page itself is tested in unit/web and process/readers/test_web.py."""
 
 from __future__ import annotations
 

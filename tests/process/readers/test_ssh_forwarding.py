@@ -23,7 +23,7 @@ from harness.readers.network import (
     network,
 )
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 GUIDE = ROOT / "docs" / "how-to" / "use-poses-on-another-computer.md"
 SSHD, SSH, KEYGEN = (
     shutil.which(name, path="/usr/sbin:/usr/bin") or "" for name in ("sshd", "ssh", "ssh-keygen")

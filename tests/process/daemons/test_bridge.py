@@ -25,7 +25,7 @@ from tsgt.station.bridge import BridgeInstrument
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "bridge_program.py"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "bridge_program.py"
 
 HELLO = """printf '{"type":"hello","bridge":1,"make":"Shell","stamps":"arrival"}\\n'; """
 

@@ -15,7 +15,7 @@ from harness.files.pos_files import SECOND, write_pos
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CONFIGS = ROOT / "configs"
 EXAMPLES = [path.read_bytes() for path in sorted(CONFIGS.rglob("*.toml"))]
 LAYOUT = (CONFIGS / "prism_layout.example.toml").read_bytes()

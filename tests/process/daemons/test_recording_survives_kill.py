@@ -19,7 +19,7 @@ from tsgt.recording import RecordingWriter, load_recording, read_lines
 if TYPE_CHECKING:
     from tsgt.errors import RecordingError
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 KILLS = 8
 
 WRITE_FOR_EVER = """

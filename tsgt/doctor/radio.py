@@ -68,9 +68,16 @@ async def check_radio(machine: Machine, config: RadioConfig, path: Path, *, daem
         chip = Chip(hal, machine.clock, settings)
         await chip.set_up()
         version = RegisterAccess(hal).read(Register.VERSION)
+        connected = await chip.dio0_connected()
         chip.sleep()
     finally:
         hal.close()
+    if not connected:
+        return failed(
+            "radio",
+            f"the radio responds, but BCM {config.wiring.dio0_pin} does not follow its DIO0: packets would be read up to 100 ms "
+            "late, and their times would be useless. Check the wire, or dio0_pin under [radio.wiring]",
+        )
     return ok(
         "radio",
         f"the radio responds (version 0x{version:02X}) and accepts its settings; nothing was transmitted",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -20,9 +21,16 @@ if TYPE_CHECKING:
     from tsgt.radio.sx127x import Hal, Wiring
     from tsgt.station.serial import OpenPort
 
+Backend = Literal["gpiod", "rpi-gpio"]
+
 DEFAULT_BAUD: Final = 115_200
+BACKENDS: Final[tuple[Backend, ...]] = ("gpiod", "rpi-gpio")
 HAT_NSS_PIN: Final = 25
 KERNEL_NSS: Final = -1
+DIO0_PINS: Final = (
+    4,
+    22,
+)  # of the Dragino HAT, and of a bare module wired as docs/how-to/wire-the-radio.md says
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,13 +58,13 @@ class Ports:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WiringSearch:
-    """Wirings to try; None: what a radio may be wired to. The defaults are the Dragino HAT's."""
+    """Wirings to try; None: what a radio may be wired to. The reset pin is the Dragino HAT's."""
 
-    backend: Literal["gpiod", "rpi-gpio"] | None = None
+    backend: Backend | None = None
     spi_device: str | None = None
     nss_pin: int | None = None
     reset_pin: int = 17
-    dio0_pin: int = 4
+    dio0_pin: int | None = None
     gpio_chip: str | None = None
 
     def wirings(self, devices: Sequence[str]) -> Iterator[WiringConfig]:
@@ -64,19 +72,21 @@ class WiringSearch:
 
         Chip select on the HAT's pin first: a HAT whose pin happens to be low would also respond to the kernel's.
         """
-        for backend in ("gpiod", "rpi-gpio") if self.backend is None else (self.backend,):
-            for nss_pin in (HAT_NSS_PIN, KERNEL_NSS) if self.nss_pin is None else (self.nss_pin,):
-                for device in devices if self.spi_device is None else (self.spi_device,):
-                    bus, _, select = device.removeprefix("spidev").partition(".")
-                    yield WiringConfig(
-                        backend=backend,
-                        spi_bus=int(bus),
-                        spi_device=int(select),
-                        reset_pin=self.reset_pin,
-                        dio0_pin=self.dio0_pin,
-                        nss_pin=nss_pin,
-                        gpio_chip=self.gpio_chip if backend == "gpiod" else None,
-                    )
+        backends = BACKENDS if self.backend is None else (self.backend,)
+        nss_pins = (HAT_NSS_PIN, KERNEL_NSS) if self.nss_pin is None else (self.nss_pin,)
+        dio0_pins = DIO0_PINS if self.dio0_pin is None else (self.dio0_pin,)
+        used = devices if self.spi_device is None else (self.spi_device,)
+        for backend, nss_pin, device, dio0_pin in product(backends, nss_pins, used, dio0_pins):
+            bus, _, select = device.removeprefix("spidev").partition(".")
+            yield WiringConfig(
+                backend=backend,
+                spi_bus=int(bus),
+                spi_device=int(select),
+                reset_pin=self.reset_pin,
+                dio0_pin=dio0_pin,
+                nss_pin=nss_pin,
+                gpio_chip=self.gpio_chip if backend == "gpiod" else None,
+            )
 
 
 async def find_radio(
@@ -85,28 +95,38 @@ async def find_radio(
     settings: LoRaSettings,
     clock: Clock,
 ) -> WiringConfig:
-    """Return the first wiring with which a radio responds and accepts all settings; nothing is transmitted.
+    """Return the first wiring with which a radio responds, accepts all settings and drives DIO0; nothing is transmitted.
 
-    Raises RadioError with the reason for each wiring if none does.
+    Raises RadioError if there is none: with the reason for each wiring, or the pins that are not DIO0.
     """
     reasons: dict[str, str] = {}
+    not_dio0: dict[int, None] = {}
     for candidate in wirings:
         try:
-            await _ask_radio(open_hal(wiring(candidate)), settings, clock)
+            connected = await _ask_radio(open_hal(wiring(candidate)), settings, clock)
         except RadioError as error:
             reasons.setdefault(str(error), _wiring_text(candidate))
-        else:
+            continue
+        if connected:
             return candidate
+        not_dio0[candidate.dio0_pin] = None
+    if not_dio0:
+        pins = " or ".join(map(str, not_dio0))
+        raise RadioError(f"the radio responds, but its DIO0 is not on BCM {pins}: give its pin as --dio0-pin")
     if not reasons:
         raise RadioNotFoundError("there is no SPI device /dev/spidev*")
-    raise RadioError("; ".join(f"{where}: {reason}" for reason, where in reasons.items()))
+    told = "; ".join(f"{where}: {reason}" for reason, where in reasons.items())
+    raise RadioError(f"no radio responds: {told}. Check that the board sits on all pins")
 
 
-async def _ask_radio(hal: Hal, settings: LoRaSettings, clock: Clock) -> None:
+async def _ask_radio(hal: Hal, settings: LoRaSettings, clock: Clock) -> bool:
+    """Return whether DIO0 is connected."""
     try:
         chip = Chip(hal, clock, settings)
         await chip.set_up()
+        connected = await chip.dio0_connected()
         chip.sleep()
+        return connected
     finally:
         hal.close()
 

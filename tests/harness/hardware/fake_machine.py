@@ -122,6 +122,14 @@ ENABLED = {
 }
 
 
+class HalWithoutDio0(SimulatedHal):
+    """A chip whose DIO0 is not wired."""
+
+    def dio0(self) -> bool:
+        """Return the level of a pin with a pull-down."""
+        return False
+
+
 class FakeMachine:
     """The machine interface, at first without problems; a test changes what it is about.
 
@@ -165,6 +173,7 @@ class FakeMachine:
         self.unreached = ""
         self.reached: list[str] = []
         self.hal_error: Exception | None = None
+        self.dio0_connected = True
         self.port: OpenPort = self._nothing_answers
         self._make_system()
         self.write("client.toml", CLIENT)
@@ -260,9 +269,8 @@ class FakeMachine:
             raise self.hal_error
         timeline = running_timeline()
         air = Air(timeline, np.random.default_rng(0), LinkModel())
-        return SimulatedHal(
-            SX1276Chip(timeline, lambda antenna: air.join(antenna, "here"), np.random.default_rng(1))
-        )
+        chip = SX1276Chip(timeline, lambda antenna: air.join(antenna, "here"), np.random.default_rng(1))
+        return SimulatedHal(chip) if self.dio0_connected else HalWithoutDio0(chip)
 
     async def _nothing_answers(self, baud: int) -> Port:
         raise InstrumentError(f"nothing answers at {baud}")

@@ -22,6 +22,15 @@ async def test_responding_radio_passes(tmp_path: Path) -> None:
     assert "0x12" in findings["radio"].detail
 
 
+async def test_unconnected_dio0_fails(tmp_path: Path) -> None:
+    """The chip responds, but nothing would tell when a packet ends."""
+    fake = FakeMachine(tmp_path)
+    fake.dio0_connected = False
+    found = (await fake.run_checks())["radio"]
+    assert found.ok is False
+    assert "BCM 4 does not follow its DIO0" in found.detail
+
+
 async def test_disabled_bus_fails(tmp_path: Path) -> None:
     """Without SPI there is no radio."""
     fake = FakeMachine(tmp_path)

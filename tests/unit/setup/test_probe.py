@@ -30,7 +30,7 @@ def pi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakePi:
     return made
 
 
-def solder(pi: FakePi, nss_pin: int | None) -> None:
+def solder(pi: FakePi, nss_pin: int | None, dio0_pin: int = 4) -> None:
     """Connect a chip; its chip select to a pin, or to the SPI controller."""
     timeline = running_timeline()
     air = Air(timeline, np.random.default_rng(0), LinkModel())
@@ -40,6 +40,11 @@ def solder(pi: FakePi, nss_pin: int | None) -> None:
         selected = not pi.levels.get(nss_pin, True) if nss_pin is not None else not pi.bus_settings["no_cs"]
         return chip.transfer(data) if selected else bytes(len(data))
 
+    def raised(_at_ns: int, level: bool) -> None:  # noqa: FBT001 (a level)
+        if dio0_pin in pi.levels:
+            pi.levels[dio0_pin] = level
+
+    chip.on_dio(0, raised)
     pi.answer = answer
     pi.on_drive = lambda pin, level: chip.set_reset(not level) if pin == 17 else None
 
@@ -50,6 +55,21 @@ async def test_chip_select_is_found(pi: FakePi, soldered: int | None, found: int
     solder(pi, soldered)
     wiring = await find_radio(WiringSearch().wirings(["spidev0.0"]), open_hal, PAPER, VirtualClock(0))
     assert (wiring.backend, wiring.nss_pin) == ("gpiod", found)
+    assert pi.open_things == 0
+
+
+async def test_pin_of_dio0_is_found(pi: FakePi) -> None:
+    """A bare module is not wired as the HAT."""
+    solder(pi, None, dio0_pin=22)
+    wiring = await find_radio(WiringSearch().wirings(["spidev0.0"]), open_hal, PAPER, VirtualClock(0))
+    assert (wiring.nss_pin, wiring.dio0_pin) == (-1, 22)
+
+
+async def test_unconnected_dio0_is_an_error(pi: FakePi) -> None:
+    """Without its edges all packets would be read late."""
+    solder(pi, None, dio0_pin=27)
+    with pytest.raises(RadioError, match="its DIO0 is not on BCM 4 or 22: give its pin as --dio0-pin"):
+        await find_radio(WiringSearch().wirings(["spidev0.0"]), open_hal, PAPER, VirtualClock(0))
     assert pi.open_things == 0
 
 

@@ -144,11 +144,11 @@ def _wiring(
         )
     except RadioError as error:
         if session.dry_run and candidates:
-            session.report("radio", ok=True, detail=f"does not respond yet ({error})")
+            session.report("radio", ok=True, detail=f"not found yet ({error})")
             return candidates[0]
         session.fail(
             "radio",
-            f"no radio responds: {error}. Check that the board sits on all pins (docs/how-to/wire-the-radio.md)",
+            f"{error} (docs/how-to/wire-the-radio.md)",
         )
     session.report("radio", ok=True, detail=f"responds; {_shown(found)}; nothing was transmitted")
     return found
@@ -156,7 +156,10 @@ def _wiring(
 
 def _shown(wiring: WiringConfig) -> str:
     select = "by the kernel" if wiring.nss_pin < 0 else f"BCM {wiring.nss_pin}"
-    return f"spidev{wiring.spi_bus}.{wiring.spi_device}, chip select {select}, back end {wiring.backend}"
+    return (
+        f"spidev{wiring.spi_bus}.{wiring.spi_device}, chip select {select}, DIO0 BCM {wiring.dio0_pin}, "
+        f"back end {wiring.backend}"
+    )
 
 
 def configure(

@@ -88,7 +88,9 @@ def _common(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Pin NRESET of the radio, BCM number.",
         ),
         click.option(
-            "--dio0-pin", type=click.IntRange(0, 1000), default=4, help="Pin DIO0 of the radio, BCM number."
+            "--dio0-pin",
+            type=click.IntRange(0, 1000),
+            help="Pin DIO0 of the radio, BCM number.  [default: found]",
         ),
         click.option("--gpio-chip", metavar="PATH", help="GPIO device.  [default: found by its label]"),
         click.option(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from tsgt.errors import RadioNotFoundError
+from tsgt.errors import RadioError, RadioNotFoundError
 from tsgt.radio.sx127x import registers as reg
 from tsgt.radio.sx127x.register_io import (
     RegisterAccess,
@@ -30,11 +30,13 @@ log = structlog.get_logger()
 RESET_LOW_NS = 1_000_000  # duration of the NRESET pulse; the chip needs 0.1 ms (section 7.2.2)
 RESET_WAIT_NS = 10_000_000  # pause after the reset; the chip needs 5 ms
 MODE_WAIT_NS = 1_000_000  # pause between a change of mode and its check; the oscillator starts in 0.25 ms
+CAD_SYMBOLS = 4  # a channel activity detection takes 1.7 to 2.3 symbols
 
 # Plain integers: members of IntFlag are slow to combine.
 _RX_DONE = int(Irq.RX_DONE)
 _TX_DONE = int(Irq.TX_DONE)
 _CRC_ERROR = int(Irq.PAYLOAD_CRC_ERROR)
+_CAD_DONE = int(Irq.CAD_DONE)
 _ABSENT = 0xFF  # an open MISO line; no state of the chip has all flags set
 
 
@@ -111,6 +113,22 @@ class Chip:
         # This pointer is unused between packets; a hung chip keeps its registers and only fails a write.
         self._probe ^= 0xFF
         self._registers.write_verified(RegisterValue(Register.FIFO_ADDR_PTR, self._probe))
+
+    async def dio0_connected(self) -> bool:
+        """Whether the DIO0 pin follows the chip; leaves it in standby.
+
+        A channel activity detection raises DIO0 at its end (table 18), and transmits nothing. Raises RadioError if it does
+        not end.
+        """
+        self.enter_standby()
+        self._registers.write(Register.IRQ_FLAGS, reg.ALL_IRQ_FLAGS)
+        self._registers.write_verified(RegisterValue(Register.DIO_MAPPING_1, reg.DIO0_CAD_DONE))
+        high_before = self._hal.dio0()
+        self._write_mode(Mode.CAD)
+        await self._pause(CAD_SYMBOLS * self._settings.symbol_ns + MODE_WAIT_NS)
+        if not self._flags() & _CAD_DONE:
+            raise RadioError("the radio does not end a channel activity detection: check power and wiring")
+        return self._hal.dio0() and not high_before
 
     def load(self, payload: bytes) -> None:
         """Clear all flags and load a packet for :meth:`send`, from standby.

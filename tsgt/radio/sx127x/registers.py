@@ -124,6 +124,7 @@ LNA_BOOST_HF = 0x03
 
 DIO0_RX_DONE = 0x00
 DIO0_TX_DONE = 0x40
+DIO0_CAD_DONE = 0x80
 
 # --- RegVersion (section 6.4) ---------------------------------------------------------------------------------
 

@@ -76,7 +76,9 @@ class MissingExtraError(TsgtError, ImportError):
     """An optional library is not installed: matplotlib, mcap."""
 
     def __init__(self, purpose: str, *, library: str, extra: str) -> None:
-        super().__init__(f"{purpose} need {library}, which is not installed: pip install 'tsgt[{extra}]'")
+        super().__init__(
+            f"{purpose} need {library}, which is not installed: pip install 'tsgt[{extra}]'; the offline bundle does not contain it"
+        )
         self.library = library
         self.extra = extra
 

@@ -33,13 +33,20 @@ AlarmName = Literal[
     "imu_recovered",
     "imu_not_used",
     "imu_used",
+    "imu_implausible",
+    "imu_plausible",
     "imu_setup_wrong",
+    "imu_setup_confirmed",
+    "station_contradicted",
     "odometry_lost",
     "odometry_recovered",
     "odometry_disagrees",
     "odometry_agrees",
     "beacon_time_rejected",
     "link_delay_anomaly",
+    "other_master",
+    "unix_clock_stepped",
+    "setup_rejected",
 ]
 
 DEFAULT_ALARMS: tuple[AlarmName, ...] = (
@@ -53,6 +60,7 @@ DEFAULT_ALARMS: tuple[AlarmName, ...] = (
     "radio_failed",
     "imu_not_used",
     "imu_setup_wrong",
+    "station_contradicted",
 )
 
 

@@ -6,13 +6,11 @@ import errno
 from typing import TYPE_CHECKING, Literal
 
 from tsgt.master.link_events import MasterEvent
+from tsgt.recording import LOW_DISK_BYTES
 
 if TYPE_CHECKING:
     from tsgt.errors import RecordingError
     from tsgt.recording import DiskStatus, RecordingStatus
-
-MIN_FREE_BYTES = 1_000_000_000
-"""Free space below which the disk is low: some hours of recording with an IMU."""
 
 RECOVERY_FACTOR = 1.25  # of that space are free again before the disk counts as recovered
 
@@ -57,7 +55,7 @@ class DiskMonitor:
             return "failed", f"the disk of the recording does not respond, {waiting}"
         if disk is None:
             return "ok", "the recording is written again"
-        least = MIN_FREE_BYTES * (1 if self._state == "ok" else RECOVERY_FACTOR)
+        least = LOW_DISK_BYTES * (1 if self._state == "ok" else RECOVERY_FACTOR)
         if disk.free_bytes >= least:
             return "ok", f"the recording is written, {_gigabytes(disk.free_bytes)} are free"
         hours = disk.free_bytes / max(recording.bytes, 1) * (now_ns - self._start_ns) / 3.6e12

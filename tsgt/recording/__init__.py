@@ -28,6 +28,7 @@ from tsgt.recording.setup_record import (
 )
 from tsgt.recording.stream_records import (
     LOW_BATTERY_PERCENT,
+    LOW_DISK_BYTES,
     PROTOCOL_VERSION,
     BeaconRecord,
     ClockRecord,
@@ -51,6 +52,7 @@ from tsgt.recording.writer import RecordingWriter
 __all__ = [
     "FORMAT_VERSION",
     "LOW_BATTERY_PERCENT",
+    "LOW_DISK_BYTES",
     "MAX_LINE_BYTES",
     "PROTOCOL_VERSION",
     "SETUP_START",

@@ -435,6 +435,10 @@ class RecordingStatus(FiniteNumbers):
     """Lines that are lost because too many were waiting."""
 
 
+LOW_DISK_BYTES = 1_000_000_000
+"""Free space below which the disk is low: some hours of recording with an IMU."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiskStatus(FiniteNumbers):
     """The space on the disk of the recording."""

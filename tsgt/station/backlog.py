@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import structlog
 
 from tsgt.model import PolarMeasurement
-from tsgt.radio.superframe import MAX_STREAMS, BeaconReception, QueuedMeasurement
+from tsgt.radio.superframe import MAX_STREAMS, QUEUE_CAPACITY, BeaconReception, QueuedMeasurement
 from tsgt.radio.superframe.wire import RESTART_SKIP, angle_code
 from tsgt.recording import MAX_LINE_BYTES, Typed, decode
 from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionRecord
@@ -17,7 +17,6 @@ from tsgt.recording.journal import AcknowledgedRecord, JournalRecord, ReceptionR
 if TYPE_CHECKING:
     from pathlib import Path
 
-MAX_MEASUREMENTS = 200_000  # 22 hours at 2.5 Hz, some 40 MB; older ones stay in the journals
 MAX_RECEPTIONS = 10_000  # more than an hour
 
 STREAM_ID_BITS = 16
@@ -81,8 +80,8 @@ def read_backlog(directory: Path, station: int) -> Backlog:
         (_read_stream(journals, each) for each in stream_ids), key=lambda each: len(each.undelivered)
     )
     undelivered, receptions = stream.undelivered, stream.receptions
-    if len(undelivered) > MAX_MEASUREMENTS:
-        log.warning("measurements_discarded", measurements=len(undelivered) - MAX_MEASUREMENTS)
+    if len(undelivered) > QUEUE_CAPACITY:
+        log.warning("measurements_discarded", measurements=len(undelivered) - QUEUE_CAPACITY)
     # The times of a run that received no beacon rest on the receptions of earlier runs on the same clock.
     boots = {each.boot for each in undelivered}
     for head, path in reversed(journals):
@@ -91,7 +90,7 @@ def read_backlog(directory: Path, station: int) -> Backlog:
     return Backlog(
         stream_id=stream.stream_id,
         first_sequence=stream.last_sequence + 1 + RESTART_SKIP,
-        queued=tuple(undelivered[-MAX_MEASUREMENTS:]),
+        queued=tuple(undelivered[-QUEUE_CAPACITY:]),
         receptions=tuple(sorted(receptions[-MAX_RECEPTIONS:], key=attrgetter("received_ns"))),
     )
 
@@ -124,7 +123,7 @@ def _read_stream(journals: list[tuple[JournalRecord, Path]], stream_id: int | No
         receptions = tail.receptions + receptions
         last_sequence = max((last_sequence, *(each.sequence for each in tail.measurements[-1:])))
         oldest = max(oldest, tail.oldest)
-        if oldest >= head.first_sequence or len(measurements) > MAX_MEASUREMENTS:
+        if oldest >= head.first_sequence or len(measurements) > QUEUE_CAPACITY:
             break
     undelivered = [each for each in measurements if each.sequence >= oldest]
     return _Stream(stream_id, last_sequence, undelivered, receptions, paths)
@@ -188,7 +187,7 @@ def _read_last(size: int, head: JournalRecord, path: Path) -> tuple[_Tail, bool]
         log.warning("journal_unreadable", path=str(path), error=error.strerror or str(error))
         return tail, True
     sufficient = acknowledged and bool(tail.measurements) and tail.measurements[0].sequence <= tail.oldest
-    return tail, sufficient or start == 0 or len(tail.measurements) > MAX_MEASUREMENTS
+    return tail, sufficient or start == 0 or len(tail.measurements) > QUEUE_CAPACITY
 
 
 def _reception(record: ReceptionRecord, zero_ns: int, boot: str) -> BeaconReception:

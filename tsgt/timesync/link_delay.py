@@ -26,7 +26,7 @@ _MIN_EXCHANGES = 8  # with fewer exchanges the jitter is unknown, and no possibl
 
 _ANOMALY_NS = 50_000.0  # smallest deviation that is reported as an anomaly
 
-_HISTORY_CAPACITY = 256  # some 25 minutes with one exchange in 16 replies
+_HISTORY_CAPACITY = 256  # 55 minutes with one exchange in 32 replies
 
 _ASYMMETRY_NS = 5_000  # bound of the delay asymmetry between two chips
 

@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from tsgt.polygon import contains, distance_to_edge, edges
+from tsgt.recording import LOW_DISK_BYTES
 from tsgt.web.frames import worst_sigma
 from tsgt.web.verdict import Finding, Level
 
@@ -28,9 +29,6 @@ MAX_IMU_AGE_S = 1.0
 MAX_WRITE_AGE_S = 5.0
 MAX_WAITING_LINES = 600
 """The master records some lines a second at least, and some sixty with poses: these are ten seconds of them."""
-
-LOW_DISK_BYTES = 500_000_000
-"""An hour and more of recording."""
 
 FULL_DISK_BYTES = 50_000_000
 

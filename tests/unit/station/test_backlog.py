@@ -187,7 +187,7 @@ def test_oldest_measurements_beyond_capacity_are_discarded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The number is logged."""
-    monkeypatch.setattr(backlog_module, "MAX_MEASUREMENTS", 3)
+    monkeypatch.setattr(backlog_module, "QUEUE_CAPACITY", 3)
     journal(tmp_path, "station1-a", head(0), *measured(*range(5)))
     with capture_logs() as logs:
         assert queued_sequences(read_backlog(tmp_path, 1)) == [2, 3, 4]

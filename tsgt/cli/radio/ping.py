@@ -17,6 +17,7 @@ from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.cli.radio.options import Modem, modem_options, wiring_options
 from tsgt.clock import SystemClock
 from tsgt.config import ModemConfig
+from tsgt.errors import RadioSettingsError
 from tsgt.radio import MAX_PAYLOAD_BYTES, LoRaSettings, airtime_us
 from tsgt.radio.ping import (
     MIN_PAYLOAD_BYTES,
@@ -28,7 +29,15 @@ from tsgt.radio.ping import (
     summarise,
     summarise_responses,
 )
-from tsgt.radio.planning import MIN_POWER_DBM, REGIONS, preset_power_dbm
+from tsgt.radio.planning import (
+    CHANNELS,
+    DIPOLE_DBI,
+    MIN_POWER_DBM,
+    REGIONS,
+    Channel,
+    power_limit_dbm,
+    preset_power_dbm,
+)
 from tsgt.radio.sx127x import RadioStatistics, SX127x, Wiring, open_hal
 
 if TYPE_CHECKING:
@@ -41,6 +50,7 @@ if TYPE_CHECKING:
 
 DEFAULT_COUNT = 100
 SIMULATED_FREQUENCY_MHZ = 905.0
+_ROUNDING_DB = 1e-9  # of sums of gains
 REPLY_MARGIN_MS = 250
 """Added to the reply's time on air: the timeout of the authors' master."""
 
@@ -82,7 +92,7 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
 @click.option(
     "--region",
     type=click.Choice(sorted(REGIONS)),
-    help="Use the power that the region allows on this channel; reject a channel outside its bands.",
+    help="Use the power that the region allows on this channel; reject a channel or a power that it does not allow.",
 )
 @click.option(
     "--power-dbm",
@@ -133,14 +143,13 @@ def ping_command(
             raise click.UsageError("give --frequency-mhz, a carrier frequency that is legal where you are")
         frequency_mhz = SIMULATED_FREQUENCY_MHZ
     frequency_hz = round(frequency_mhz * 1e6)
-    preset_dbm = MIN_POWER_DBM
     if region is not None:
-        preset_dbm = preset_power_dbm(region, frequency_hz=frequency_hz, bandwidth_hz=modem.bandwidth_hz)
+        power_dbm = _legal_power_dbm(region, frequency_hz, modem.bandwidth_hz, power_dbm)
     settings = LoRaSettings(
         frequency_hz=frequency_hz,
         **dataclasses.asdict(modem),
         sync_word=sync_word,
-        power_dbm=preset_dbm if power_dbm is None else power_dbm,
+        power_dbm=MIN_POWER_DBM if power_dbm is None else power_dbm,
     )
     if answering:
         _answer(settings, wiring, count=count, as_json=as_json)
@@ -204,6 +213,22 @@ def ping_command(
         click.echo(f"round trip   {_times_text(summary.round_trip_ns)}, TxDone to RxDone")
         click.echo(f"turnaround   {_times_text(summary.turnaround_ns)}, RxDone to start of the reply, there")
     return 0 if summary.received else CHECK_FAILED
+
+
+def _legal_power_dbm(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int | None) -> int:
+    """Return the power with a dipole; raises RadioSettingsError if the region does not allow it."""
+    channel = Channel(frequency_hz, bandwidth_hz)._asdict()
+    if power_dbm is None:
+        power_dbm = preset_power_dbm(region, **channel)
+    limit_dbm = power_limit_dbm(region, **channel, antenna_gain_dbi=DIPOLE_DBI)
+    if power_dbm > limit_dbm + _ROUNDING_DB:
+        legal = CHANNELS[region]
+        raise RadioSettingsError(
+            f"{region} allows {limit_dbm:.1f} dBm into a dipole at {frequency_hz / 1e6:g} MHz and {bandwidth_hz / 1e3:g} kHz, "
+            f"and {power_dbm} dBm would be transmitted; a legal channel: --frequency-mhz {legal.frequency_hz / 1e6:g} "
+            f"--bandwidth-khz {legal.bandwidth_hz / 1e3:g}"
+        )
+    return power_dbm
 
 
 def _answer(settings: LoRaSettings, wiring: Wiring, *, count: int | None, as_json: bool) -> None:

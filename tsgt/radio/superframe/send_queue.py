@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from tsgt.model import Status
 
-QUEUE_CAPACITY = 100_000  # eleven hours of measurements, about 30 MB
+QUEUE_CAPACITY = 200_000  # 22 hours at 2.5 Hz, about 60 MB; older ones stay in the journals
 
 _MAX_QUALITY = 15
 _SEQUENCE_BITS = 8

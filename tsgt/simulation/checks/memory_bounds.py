@@ -9,7 +9,7 @@ from tsgt.master.classic import DUPLICATE_WINDOW
 from tsgt.master.stream_server import QUEUE_LINES
 from tsgt.radio.superframe import QUEUE_CAPACITY
 from tsgt.recording.recorder import HUNG_DISK_FACTOR, MAX_PENDING_LINES
-from tsgt.station.backlog import MAX_MEASUREMENTS, MAX_RECEPTIONS
+from tsgt.station.backlog import MAX_RECEPTIONS
 from tsgt.timesync import MAX_SAMPLES
 
 MAX_ENTRIES = 500
@@ -24,7 +24,7 @@ STATED_BOUNDS = {
     ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
     ("SuperframeLink", "_unsynced"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,  # whose lines wait there
     ("SendQueue", "_queue"): QUEUE_CAPACITY,
-    ("Backlog", "queued"): MAX_MEASUREMENTS,
+    ("Backlog", "queued"): QUEUE_CAPACITY,
     ("Backlog", "receptions"): MAX_RECEPTIONS,
     ("ImuSetupMonitor", "_records"): MAX_IMU_LINES,
     ("ImuTakeover", "_records"): MAX_IMU_LINES,

@@ -273,3 +273,11 @@ def test_channel_outside_the_region_is_rejected(tsgt: Tsgt) -> None:
     done = tsgt("radio", "ping", "--simulated", "--frequency-mhz", 905, "--region", "EU868")
     assert done.code == 1
     assert "905 MHz with 250 kHz is not within a band of EU868" in done.err
+
+
+def test_power_above_the_limit_of_the_region_is_rejected(tsgt: Tsgt) -> None:
+    """With --region the command does not transmit more than is legal, even if the radio cannot do with less."""
+    done = tsgt("radio", "ping", "--simulated", "--frequency-mhz", 905, "--region", "CA915")
+    assert done.code == 1
+    assert "CA915 allows" in done.err
+    assert "2 dBm would be transmitted" in done.err

@@ -29,7 +29,7 @@ from tsgt.master.observers import GeofenceObserver, layout_monitor
 from tsgt.master.publisher import Publisher
 from tsgt.master.reacquisition_hints import ReacquisitionHints
 from tsgt.master.recording_thread import RecordingDisk, RecordingThread, disk_status
-from tsgt.master.reload import reloading
+from tsgt.master.reload import reloading, usable_setup
 from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics
 from tsgt.master.stream_server import StreamServer
@@ -113,7 +113,7 @@ async def run_through_suspensions(
         log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
         if dependencies.read_setup is not None:
             with suppress(ConfigError):  # a file that is being edited: those in force before remain
-                parameters = dependencies.read_setup()
+                parameters = usable_setup(dependencies.read_setup)
 
 
 async def run_master(

@@ -100,9 +100,10 @@ class Publisher:
 
         The set-up record has to follow, as in a replay.
         """
+        estimator = LiveEstimator(parameters, self._start_check)
         self.advance(self._now_ns())
         record(encode_line(parameters))
-        self._estimator = LiveEstimator(parameters, self._start_check)
+        self._estimator = estimator
         self._no_poses = parameters.no_poses
         self._observers = observers
 

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from tsgt.errors import ConfigError, DegenerateGeometryError
+from tsgt.estimation import LiveEstimator
 from tsgt.master.link_events import MasterEvent
 
 if TYPE_CHECKING:
@@ -17,6 +18,18 @@ if TYPE_CHECKING:
 
 RELOAD_SIGNAL = signal.SIGUSR1
 """Not SIGHUP, which a lost terminal sends as well: it ends the master."""
+
+
+def usable_setup(read: Callable[[], Parameters]) -> Parameters:
+    """Read the set-up files; raises ConfigError if they cannot be read or give no poses."""
+    parameters = read()
+    if parameters.no_poses is not None:
+        raise ConfigError(parameters.no_poses)
+    try:
+        LiveEstimator(parameters)
+    except DegenerateGeometryError as error:
+        raise ConfigError(str(error)) from error
+    return parameters
 
 
 @contextmanager
@@ -35,13 +48,11 @@ def reloading(
 
     def reload() -> None:
         try:
-            parameters = read()
-            if parameters.no_poses is not None:
-                raise ConfigError(parameters.no_poses)
-            set_up(parameters)
-        except (ConfigError, DegenerateGeometryError) as error:
+            parameters = usable_setup(read)
+        except ConfigError as error:
             report(MasterEvent("setup_rejected", f"the old set-up remains in force: {error}"))
         else:
+            set_up(parameters)
             stations = ", ".join(str(each.station) for each in parameters.stations)
             prisms = ", ".join(str(each.prism) for each in parameters.prisms)
             message = f"new set-up in force: frames of stations {stations}; prisms {prisms}"

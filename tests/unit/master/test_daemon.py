@@ -300,9 +300,19 @@ async def test_uncalibrated_master_takes_a_calibration_while_it_runs(tmp_path: P
     assert len(whole.measurements) == loaded.left_out + len(loaded.measurements)
 
 
-@pytest.mark.parametrize("found", [ConfigError("frames.toml: not TOML"), UNCALIBRATED])
+COLLINEAR = replace(
+    DRIVING.parameters,
+    prisms=tuple(
+        replace(prism, position_m=(0.3 * prism.prism, 0.0, 1.0)) for prism in DRIVING.parameters.prisms
+    ),
+)
+
+UNUSABLE = [ConfigError("frames.toml: not TOML"), UNCALIBRATED, COLLINEAR]
+
+
+@pytest.mark.parametrize("found", UNUSABLE)
 async def test_unusable_set_up_leaves_the_old_one(tmp_path: Path, found: ConfigError | Parameters) -> None:
-    """A broken or missing file is an event, and poses go on."""
+    """A broken or missing file and prisms in a line are an event, and poses go on; the recording agrees."""
 
     def read_setup() -> Parameters:
         if isinstance(found, ConfigError):
@@ -316,6 +326,32 @@ async def test_unusable_set_up_leaves_the_old_one(tmp_path: Path, found: ConfigE
     assert events(field) == ["setup_rejected"]
     assert len(field.of(SetupRecord)) == 1
     assert field.of(PoseRecord)[-1].valid
+    loaded = load_recording(field.recording())
+    assert (loaded.parameters, loaded.left_out) == (DRIVING.parameters, 0)
+
+
+@pytest.mark.parametrize("found", UNUSABLE)
+async def test_unusable_set_up_after_a_suspension_leaves_the_old_one(
+    tmp_path: Path, found: ConfigError | Parameters
+) -> None:
+    """The master restarts with what was in force before."""
+    suspended_ns = 0
+
+    def read_setup() -> Parameters:
+        if isinstance(found, ConfigError):
+            raise found
+        return found
+
+    async with (
+        field_of(tmp_path, DRIVING) as field,
+        running(field.master(read_setup=read_setup, suspended_ns=lambda: suspended_ns)),
+    ):
+        await asyncio.sleep(5)
+        suspended_ns = 8_000_000_000
+        await asyncio.sleep(12)
+    assert events(field)[-1] == "computer_resumed"
+    assert field.of(PoseRecord)[-1].valid
+    assert load_recording(field.recording()).parameters == DRIVING.parameters
 
 
 class ImuProgram:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+_COPY_BYTES = 1_000_000
+
 
 class RecordingWriter:
     """Appends lines to a recording, each completely or not at all.
@@ -58,6 +60,8 @@ class RecordingWriter:
             self._torn_at: int | None = None
             self.cut_bytes = self._repair()
             self.size = os.fstat(self._fd).st_size
+            self._synced_size = self.size  # what was there before belongs to another run
+            self._sync_failed = False
         except OSError as error:
             os.close(self._fd)
             raise RecordingError(f"cannot be continued ({error.strerror})", path=path) from error
@@ -143,13 +147,30 @@ class RecordingWriter:
             if not self._unsynced:
                 return
             self._unsynced = False
+            size = self.size  # lines that are written meanwhile are in the next sync
             try:
+                if self._sync_failed:
+                    self._write_again(size)
                 (self._sync_file or os.fsync)(self._fd)
+                self._synced_size, self._sync_failed = size, False
             except OSError as error:
-                self._unsynced = True
+                self._unsynced = self._sync_failed = True
                 raise RecordingError(
                     f"cannot be brought to the disk ({error.strerror}); check the disk", path=self._path
                 ) from error
+
+    def _write_again(self, size: int) -> None:
+        """Give the kernel the bytes since the last sync once more.
+
+        Linux reports a failed write to the disk once, and takes the bytes for written from then on; it still has them in memory.
+        """
+        fd = os.open(self._path, os.O_WRONLY | os.O_CLOEXEC)  # O_APPEND would append them
+        try:
+            at = self._synced_size
+            while data := os.pread(self._fd, min(size - at, _COPY_BYTES), at):
+                at += os.pwrite(fd, data, at)
+        finally:
+            os.close(fd)
 
     def close(self) -> None:
         """Sync and close the file; a second call does nothing."""

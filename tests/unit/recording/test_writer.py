@@ -254,6 +254,36 @@ def test_failed_sync_is_retried(writer: RecordingWriter, monkeypatch: pytest.Mon
     writer.sync()
 
 
+def test_lines_of_a_failed_sync_are_written_again(
+    writer: RecordingWriter, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel takes them for written after one error, though they may never have reached the disk."""
+    real, calls = os.pwrite, []
+
+    def pwrite(descriptor: int, data: bytes, at: int) -> int:
+        calls.append((bytes(data), at))
+        return real(descriptor, data, at)
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    writer.sync()
+    synced_bytes = writer.size
+    writer.write(measurement(0))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", failing)
+        with pytest.raises(RecordingError):
+            writer.sync()
+    assert calls == []
+    writer.write(measurement(1))
+    writer.sync()
+    writer.write(measurement(2))
+    writer.sync()
+    expected = recording_bytes(*map(measurement, range(3)))
+    assert calls == [
+        (expected[synced_bytes : len(recording_bytes(*map(measurement, range(2))))], synced_bytes)
+    ]
+    assert path.read_bytes() == expected
+
+
 def failing(*_: object) -> None:
     """Stand in for a system call on a broken disk."""
     raise OSError(5, "broken")

@@ -114,7 +114,7 @@ def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[bytes]
             started.kill()
 
 
-@pytest.fixture(params=PROTOCOLS)
+@pytest.fixture(params=["superframe", pytest.param("classic", marks=pytest.mark.slow)])
 def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
     """Return a folder with both configurations; channel, instrument and client run."""
     protocol = PROTOCOLS[request.param]

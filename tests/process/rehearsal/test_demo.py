@@ -127,7 +127,7 @@ def _end(demo: Demo) -> dict[str, object]:
     return result
 
 
-@pytest.mark.parametrize("protocol", ["superframe", "classic"])
+@pytest.mark.parametrize("protocol", ["superframe", pytest.param("classic", marks=pytest.mark.slow)])
 def test_demo_streams_records_and_summarises(start: Start, folder: Path, protocol: str) -> None:
     """A reader gets live poses; the result has errors and the recording."""
     output = folder / "kept.jsonl"
@@ -154,7 +154,11 @@ def test_demo_streams_records_and_summarises(start: Start, folder: Path, protoco
     assert len(load_recording(output).measurements) > 20
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    ids=lambda number: number.name,
+)
 def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signal.Signals) -> None:
     """SIGINT and SIGTERM end demo and daemons with the result so far, exit 0, and no socket left."""
     demo = start("--duration", "60")
@@ -236,6 +240,7 @@ def _journalled(folder: Path, station: int) -> dict[int, int]:
     }
 
 
+@pytest.mark.slow
 def test_killed_daemons_restart_without_loss(start: Start, folder: Path) -> None:
     """After SIGKILL of each daemon poses continue, and every journalled measurement is delivered."""
     demo = start("--duration", "120")

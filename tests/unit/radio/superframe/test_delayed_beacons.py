@@ -15,11 +15,17 @@ from tsgt.radio.superframe.wire import Authenticator
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from _pytest.mark.structures import ParameterSet
     from harness.radio.superframe_loop import LoopStation
 
 DELAYS_NS = (300_000, 3 * MS, 30 * MS)
 LONG_DELAYS_NS = (66 * MS, 80 * MS, 131 * MS, 248 * MS)
 """Beyond the range of the low bits of a time, which nearly wrap after 131 ms."""
+
+
+def slow(*beacons: list[int]) -> list[ParameterSet]:
+    """Return combinations that run in `make test-all` only."""
+    return [pytest.param(each, marks=pytest.mark.slow) for each in beacons]
 
 
 def running_loop(frames: int = 0) -> SuperframeLoop:
@@ -114,7 +120,7 @@ def test_growing_delay_is_detected(step_ns: int) -> None:
 
 
 @pytest.mark.parametrize("backlog_s", [0, 20])
-@pytest.mark.parametrize("which", [[0], [0, 1], [1], [2], [0, 1, 2], [3, 4], [0, 1, 2, 3]])
+@pytest.mark.parametrize("which", [[0], [0, 1], *slow([1], [2], [0, 1, 2], [3, 4], [0, 1, 2, 3])])
 @pytest.mark.parametrize("late_ns", DELAYS_NS + LONG_DELAYS_NS)
 def test_delayed_first_beacons_stay_within_bounds(late_ns: int, which: list[int], backlog_s: int) -> None:
     """Including measurements made before the first beacon."""
@@ -284,7 +290,7 @@ def test_delayed_reply_with_old_measurement_is_ignored(earlier_ms: int, late_ms:
     assert set(member.received) == set(member.made_ns)
 
 
-@pytest.mark.parametrize("which", [[0, 1], [1, 2], [0, 1, 2], [1, 2, 3], [1, 2, 3, 4]])
+@pytest.mark.parametrize("which", [[0, 1], *slow([1, 2], [0, 1, 2], [1, 2, 3]), [1, 2, 3, 4]])
 @pytest.mark.parametrize("away_s", [0, 20, 60])
 @pytest.mark.parametrize("late_ms", [10, 20, 29])
 def test_equally_delayed_first_beacons_give_no_backlog_timestamps(

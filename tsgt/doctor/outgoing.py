@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 _HIDDEN = (Path("/home"), Path("/root"), Path("/run/user"))  # from a unit with ProtectHome=yes
 _CLIENT_DROP_IN = "/etc/systemd/system/tsgt-client.service.d/network-instrument.conf"
-_DROP_IN = "sudo systemctl edit tsgt-master, and add the lines of docs/how-to/send-alarms.md, step 2"
+_BUNDLE = "(in a clone, or in /usr/share/doc/tsgt)"
+_DROP_IN = (
+    f"sudo systemctl edit tsgt-master, and add the lines of docs/how-to/send-alarms.md {_BUNDLE}, step 2"
+)
 
 
 def check_geofence_commands(
@@ -57,7 +60,7 @@ def check_instrument_network(address: TcpAddress, service: Mapping[str, str] | N
         return failed(
             "instrument_network",
             f"the sandbox of the service denies the network ({denied}): sudo install -D -m 644"
-            f" configs/systemd/network-instrument.conf {_CLIENT_DROP_IN}, then sudo systemctl daemon-reload",
+            f" configs/systemd/network-instrument.conf {_CLIENT_DROP_IN} {_BUNDLE}, then sudo systemctl daemon-reload",
         )
     return ok("instrument_network", f"the client may connect to {address}")
 

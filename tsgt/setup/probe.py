@@ -27,10 +27,7 @@ DEFAULT_BAUD: Final = 115_200
 BACKENDS: Final[tuple[Backend, ...]] = ("gpiod", "rpi-gpio")
 HAT_NSS_PIN: Final = 25
 KERNEL_NSS: Final = -1
-DIO0_PINS: Final = (
-    4,
-    22,
-)  # of the Dragino HAT, and of a bare module wired as docs/how-to/wire-the-radio.md says
+DIO0_PINS: Final = (4, 22)  # of the HAT, and of a bare module wired as docs/how-to/wire-the-radio.md says
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -148,7 +148,7 @@ def _wiring(
             return candidates[0]
         session.fail(
             "radio",
-            f"{error} (docs/how-to/wire-the-radio.md)",
+            f"{error}. See docs/how-to/wire-the-radio.md, in a clone or in /usr/share/doc/tsgt",
         )
     session.report("radio", ok=True, detail=f"responds; {_shown(found)}; nothing was transmitted")
     return found

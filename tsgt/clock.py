@@ -67,8 +67,19 @@ def suspended_ns() -> int:
     """Return for how long this computer has been suspended since it was started; meanwhile CLOCK_MONOTONIC stood still."""
     if not hasattr(time, "CLOCK_BOOTTIME"):  # not Linux
         return 0
-    # A reading may be interrupted; the shortest one was not.
-    return min(-time.monotonic_ns() + time.clock_gettime_ns(time.CLOCK_BOOTTIME) for _ in range(3))
+    return _ahead_ns(lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME), time.monotonic_ns)
+
+
+def _ahead_ns(clock_ns: Callable[[], int], monotonic_ns: Callable[[], int]) -> int:
+    """Return by how much a clock is ahead of another one.
+
+    Each reading of it lies between two of the other clock. An interruption spreads these; the closest pair counts.
+    """
+    readings = []
+    for _ in range(3):
+        before_ns, at_ns, after_ns = monotonic_ns(), clock_ns(), monotonic_ns()
+        readings.append((after_ns - before_ns, at_ns - (before_ns + after_ns) // 2))
+    return min(readings)[1]
 
 
 class SuspensionWatch:
@@ -113,8 +124,8 @@ class UnixTimeline:
 
     @classmethod
     def fixed_now(cls, clock: Clock) -> UnixTimeline:
-        """Read both clocks once."""
-        return cls(clock.realtime_ns() - clock.monotonic_ns())
+        """Compare both clocks now."""
+        return cls(_ahead_ns(clock.realtime_ns, clock.monotonic_ns))
 
     def unix_ns(self, monotonic_ns: int) -> int:
         """Convert a monotonic instant to Unix time, in nanoseconds."""

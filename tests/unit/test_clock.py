@@ -1,10 +1,10 @@
-"""A suspension of the computer, during which CLOCK_MONOTONIC stands still."""
+"""A suspension of the computer, during which CLOCK_MONOTONIC stands still, and the timeline of a program."""
 
 from __future__ import annotations
 
 import pytest
 
-from tsgt.clock import SuspensionWatch, suspended_ns
+from tsgt.clock import SuspensionWatch, SystemClock, UnixTimeline, suspended_ns
 from tsgt.errors import ComputerSuspendedError
 
 
@@ -35,3 +35,29 @@ def test_suspensions_of_this_computer_are_counted() -> None:
     """Two readings agree within less than what counts as a suspension."""
     SuspensionWatch(suspended_ns).check()
     assert suspended_ns() >= -5_000_000
+
+
+class InterruptedClock(SystemClock):
+    """A clock whose n-th reading comes after an interruption of ``interruptions_ns[n]``, or of 100 ns."""
+
+    def __init__(self, interruptions_ns: list[int]) -> None:
+        self._interruptions_ns = interruptions_ns
+        self._now_ns = 5_000_000_000
+
+    def monotonic_ns(self) -> int:
+        """Return the time after the next interruption."""
+        self._now_ns += self._interruptions_ns.pop(0) if self._interruptions_ns else 100
+        return self._now_ns
+
+    def realtime_ns(self) -> int:
+        """Return the Unix time, likewise."""
+        return 1_700_000_000_000_000_000 + self.monotonic_ns()
+
+
+@pytest.mark.parametrize("interrupted", range(6))
+def test_interruption_does_not_shift_timeline(interrupted: int) -> None:
+    """While the clocks are read, the program is interrupted for 50 ms, anywhere in two of three readings."""
+    interruptions_ns = [100] * 9
+    interruptions_ns[interrupted] = interruptions_ns[interrupted + 3] = 50_000_000
+    timeline = UnixTimeline.fixed_now(InterruptedClock(interruptions_ns))
+    assert abs(timeline.unix_at_zero_ns - 1_700_000_000_000_000_000) <= 200

@@ -22,8 +22,8 @@ from tsgt.recording.journal import InstrumentRecord, JournalRecord
 from tsgt.recording.recorder import Recorder
 from tsgt.station.backlog import STREAM_ID_BITS, Backlog, read_backlog
 from tsgt.station.control_socket import AtmosphereRequest, AtmosphereResponse, ControlSocket
-from tsgt.station.instrument import Atmosphere
-from tsgt.station.instrument_supervisor import CommandResult, InstrumentSupervisor
+from tsgt.station.instrument import Atmosphere, HostClockDependent
+from tsgt.station.instrument_supervisor import CommandResult, InstrumentSupervisor, RequestedAtmosphere
 from tsgt.station.journal import WRITE_TIMEOUT_S, JournalQueue
 from tsgt.station.links import ClassicLink, SuperframeLink
 from tsgt.station.session import ClientSession
@@ -52,21 +52,29 @@ async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies:
     journal cannot be created: missing folder, no permission. Raises StreamError if the control socket cannot be
     created: another client serves it.
     """
+    requested = RequestedAtmosphere()
     while True:
         watch = SuspensionWatch(dependencies.suspended_ns)
         run = _run_until_suspended(
-            config, settings, replace(dependencies, boot=watch.boot(dependencies.boot)), watch
+            config, settings, replace(dependencies, boot=watch.boot(dependencies.boot)), watch, requested
         )
         suspended = await service.until_suspended(run)
         log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
+        if isinstance(dependencies.instrument, HostClockDependent):
+            dependencies.instrument.host_clock_restarted()
 
 
 async def _run_until_suspended(
-    config: ClientConfig, settings: LoRaSettings, dependencies: ClientDependencies, watch: SuspensionWatch
+    config: ClientConfig,
+    settings: LoRaSettings,
+    dependencies: ClientDependencies,
+    watch: SuspensionWatch,
+    requested: RequestedAtmosphere,
 ) -> None:
     """Run until cancelled. Raises ComputerSuspendedError after a resume: nothing then compares with times from before.
 
-    All that is known of the clocks is made anew, as after a reboot; the backlog is in the journal.
+    All that is known of the clocks is made anew, as after a reboot; the backlog is in the journal. The requested
+    atmosphere is kept.
     """
     clock, random_bits = dependencies.clock, dependencies.random_bits
     timeline = UnixTimeline.fixed_now(clock)
@@ -118,6 +126,7 @@ async def _run_until_suspended(
                         settings,
                         dependencies,
                         watch,
+                        requested,
                         timeline,
                         recorder,
                         journal,
@@ -148,6 +157,7 @@ class _StationClient:
         settings: LoRaSettings,
         dependencies: ClientDependencies,
         watch: SuspensionWatch,
+        requested: RequestedAtmosphere,
         timeline: UnixTimeline,
         recorder: Recorder,
         journal: JournalQueue,
@@ -171,6 +181,7 @@ class _StationClient:
             on_reading=self._on_reading,
             on_record=self._on_record,
             on_result=self._on_result,
+            requested=requested,
         )
         self._link: Link = (
             ClassicLink(
@@ -204,6 +215,7 @@ class _StationClient:
         self._journal.write(measurement, partial(self._link.offer, measurement))
 
     def _on_record(self, record: InstrumentRecord) -> None:
+        self._watch.check()
         self._record = replace(record, stamp_ns=self._now_ns())
         self._journal.write(self._record)
 
@@ -216,6 +228,7 @@ class _StationClient:
         elif result.reading is None:
             self._link.respond_single(None)
         else:
+            self._watch.check()
             reading = result.reading
             target = self._session.single_measurement(reading, self._timeline.unix_ns(reading.at_ns))
             self._journal.write(target, partial(self._link.respond_single, target))

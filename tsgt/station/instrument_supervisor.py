@@ -47,6 +47,13 @@ class CommandResult:
     reading: Reading | None = None
 
 
+@dataclass(slots=True)
+class RequestedAtmosphere:
+    """The atmosphere last requested, or None; applied after each connection, also by the next supervisor."""
+
+    atmosphere: Atmosphere | None = None
+
+
 class InstrumentSupervisor:
     """The only owner of an instrument.
 
@@ -62,6 +69,8 @@ class InstrumentSupervisor:
         Called with identity and settings after each connection and change, before the first reading they apply to.
     on_result
         Called exactly once for each command.
+    requested
+        Request of an earlier supervisor; None: there was none.
     """
 
     def __init__(
@@ -73,6 +82,7 @@ class InstrumentSupervisor:
         on_reading: Callable[[Reading], None],
         on_record: Callable[[InstrumentRecord], None],
         on_result: Callable[[CommandResult], None],
+        requested: RequestedAtmosphere | None = None,
     ) -> None:
         self._instrument = instrument
         self._session = session
@@ -81,8 +91,7 @@ class InstrumentSupervisor:
         self._on_record = on_record
         self._on_result = on_result
         self._command: Command | None = None
-        # The atmosphere last requested; applied again after each connection.
-        self._atmosphere: Atmosphere | None = None
+        self._requested = requested or RequestedAtmosphere()
         self._atmosphere_pending = False
         self._atmosphere_response: asyncio.Future[str] | None = None
         self._work_pending = asyncio.Event()
@@ -110,7 +119,7 @@ class InstrumentSupervisor:
     async def set_atmosphere(self, atmosphere: Atmosphere) -> str:
         """Set it now and after each connection; return why it is not set, or not yet, empty when it is."""
         _respond(self._atmosphere_response, "superseded by a later request")
-        self._atmosphere = atmosphere
+        self._requested.atmosphere = atmosphere
         if self.description is None:
             return NOT_CONNECTED
         self._atmosphere_pending = True
@@ -157,11 +166,11 @@ class InstrumentSupervisor:
         self.description = description
         self._connected_ns = self._clock.monotonic_ns()
         log.info("instrument_connected", instrument=description)
-        self._atmosphere_pending = self._atmosphere is not None
+        self._atmosphere_pending = self._requested.atmosphere is not None
         while True:
             self._publish_record()
-            if self._atmosphere_pending and self._atmosphere is not None:
-                await self._set_atmosphere(self._atmosphere)
+            if self._atmosphere_pending and self._requested.atmosphere is not None:
+                await self._set_atmosphere(self._requested.atmosphere)
             elif self._command is not None:
                 await self._execute(self._command)
             elif self._session.mode == "direct":
@@ -238,8 +247,8 @@ class InstrumentSupervisor:
         except InstrumentRefusedError as error:
             problem = str(error)
             log.warning("atmosphere_refused", **values, error=problem)
-            if self._atmosphere is atmosphere:
-                self._atmosphere = None
+            if self._requested.atmosphere is atmosphere:
+                self._requested.atmosphere = None
         else:
             problem = ""
             log.info("atmosphere_set", **values)

@@ -21,11 +21,9 @@ MIN_EXCHANGES: Final = 4
 _WINDOW_NS: Final = 300e9
 _BIN_NS: Final = 2e9
 _MIN_KEPT: Final = 30  # number of exchanges that are kept regardless of their age
-_STEADY_NS: Final = 120e9  # a skew from a longer span than this is kept over a power cycle
 
 _MAX_SKEW: Final = 300e-6
-_UNKNOWN_SKEW_SIGMA: Final = 100e-6
-_KNOWN_SKEW_SIGMA: Final = 5e-6  # at least, over a power cycle
+_SKEW_SIGMA: Final = 100e-6
 _SKEW_WANDER: Final = 1e-6
 _HALF_MS_NS: Final = 0.5e6
 _ROUNDING_NS: Final = 0.3e6
@@ -68,8 +66,6 @@ class ExchangeClock:
     """
 
     def __init__(self) -> None:
-        self._known_skew = 0.0
-        self._known_sigma = _UNKNOWN_SKEW_SIGMA
         self._seen = 0
         self.resets = 0
         self.inconsistent = False
@@ -187,10 +183,6 @@ class ExchangeClock:
         if not recent or low - high > 2 * _HALF_MS_NS:
             return True
         agreeing = list(self._candidates)
-        if self._bins[-1].high_x - self._bins[0].high_x > _STEADY_NS:
-            skew = self._skew()
-            variance = sum(slope.weight * (slope.skew - skew) ** 2 for slope in self._slopes)
-            self._known_skew, self._known_sigma = skew, max(math.sqrt(variance), _KNOWN_SKEW_SIGMA)
         self._reset()
         self.resets += 1
         for _, ms, sent, arrived in agreeing:
@@ -200,8 +192,6 @@ class ExchangeClock:
     # --- The possible offsets ---------------------------------------------------------------------------------
 
     def _skew(self) -> float:
-        if not self._slopes:
-            return self._known_skew
         return sum(slope.weight * slope.skew for slope in self._slopes)
 
     def _range(self, x: float) -> tuple[float, float]:
@@ -253,9 +243,9 @@ class ExchangeClock:
             best = max(offsets, key=lambda each: each[2] - each[1])[0]
             first, last = (possible[0][0], possible[-1][0]) if possible else (best, best)
             least, most = max(first - step, least), min(last + step, most)
+        # An earlier fit says nothing of the skew: it may be of a time when NTP slewed the host's clock.
         weights = [
-            (high - low + 1.0) * math.exp(-0.5 * ((skew - self._known_skew) / self._known_sigma) ** 2)
-            for skew, low, high in possible
+            (high - low + 1.0) * math.exp(-0.5 * (skew / _SKEW_SIGMA) ** 2) for skew, low, high in possible
         ]
         total = sum(weights)
         return [_Slope(*each, weight / total) for each, weight in zip(possible, weights, strict=True)]

@@ -147,3 +147,24 @@ def test_gap_widens_the_uncertainty() -> None:
     assert later is not None
     assert abs(later.host_ns - sent_ns - 600e9) < later.bound_ns
     assert later.sigma_ns > 5 * now.sigma_ns
+
+
+@pytest.mark.parametrize("slew_ppm", [100, 200, 300, 400, 500, -500])
+def test_slew_of_the_host_clock_is_survived(slew_ppm: int) -> None:
+    """No line fits the offset then: errors stay below a round trip, and after the window they are as stated again."""
+    slewed_s, slew_s, window_s, max_round_trip_ns = 200.0, 100.0, 300.0, 14 * MS
+    rng, clock = np.random.default_rng(4), ExchangeClock()
+
+    def host_ns(true_s: float) -> int:
+        return round(1e9 * true_s + 1e3 * slew_ppm * min(max(true_s - slewed_s, 0.0), slew_s))
+
+    for true_s in np.arange(0.0, slewed_s + slew_s + window_s + 60.0, 0.5):
+        request_s, response_s = rng.uniform(2e-3, max_round_trip_ns / 2e9, 2)
+        count_ms = int((true_s + request_s) * 1000)
+        clock.add(count_ms, host_ns(true_s), host_ns(true_s + request_s + response_s))
+        time = clock.at(count_ms)
+        if time is not None:
+            error_ns = abs(time.host_ns - host_ns((count_ms + 0.5) / 1000))
+            assert error_ns < max_round_trip_ns
+            if not slewed_s < true_s < slewed_s + slew_s + window_s:
+                assert error_ns <= min(time.bound_ns, 2.2 * time.sigma_ns)

@@ -194,6 +194,13 @@ class BridgeInstrument:
         if program is not None:
             await program.terminate()
 
+    def host_clock_restarted(self) -> None:
+        """Drop queued readings and the fit of the instrument's clock."""
+        if self._readings:
+            log.warning("readings_dropped", readings=len(self._readings))
+        self._readings.clear()
+        self._timestamper.host_clock_restarted(self._clock.monotonic_ns())
+
     # --- Commands ---------------------------------------------------------------------------------------------
 
     def _next_id(self) -> int:

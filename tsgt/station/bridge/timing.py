@@ -57,6 +57,11 @@ class LineTimestamper:
         if identity != self._clock_identity:
             self._clock_identity, self._clock, self._last = identity, InstrumentClock(), None
 
+    def host_clock_restarted(self, now_ns: int) -> None:
+        """Drop the clock fit, and reject times before now: they are of the clock before the suspension."""
+        self._clock, self._pending = InstrumentClock(), []
+        self._last_at_ns = now_ns
+
     def drop_other_prisms(self, prism: int) -> None:
         """Drop measurements of other prisms that wait for the clock fit."""
         self._pending = [pending for pending in self._pending if pending[1] == prism]

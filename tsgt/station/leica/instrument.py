@@ -121,6 +121,10 @@ class LeicaInstrument:
             if line is not None:
                 await line.close()
 
+    def host_clock_restarted(self) -> None:
+        """Drop the fit of the instrument's clock."""
+        self._timestamper.host_clock_restarted()
+
     async def _stop_tracking(self) -> None:
         tracking, self._tracking = self._tracking, None
         if tracking is not None:

@@ -74,8 +74,12 @@ class DistanceTimestamper:
     def reset(self, *, over_network: bool) -> None:
         """Start over with another instrument."""
         self.over_network = over_network
-        self._clock_fit = ExchangeClock() if over_network else InstrumentClock()
         self._last_ms = None
+        self.host_clock_restarted()
+
+    def host_clock_restarted(self) -> None:
+        """Start over with the host's clock; a distance that has been reported is still not new."""
+        self._clock_fit = ExchangeClock() if self.over_network else InstrumentClock()
         self.problem = ""
 
     async def synchronise(self, line: GeoComConnection) -> None:

@@ -24,14 +24,14 @@ def call(script: str, *arguments: str, root: Path) -> None:
 def installed(tmp_path: Path) -> Path:
     """Return a system with an environment, an enabled service, a configuration and a recording."""
     for name in (
-        "opt/tsgt-aB3dE6/bin/tsgt",
+        "opt/.tsgt/aB3dE6/bin/tsgt",
         "etc/tsgt/client.toml",
         "var/lib/tsgt/station1.jsonl",
-        "opt/other/file",
+        "opt/tsgt-master/file",
     ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
-    (tmp_path / "opt/tsgt").symlink_to("/opt/tsgt-aB3dE6")
+    (tmp_path / "opt/tsgt").symlink_to("/opt/.tsgt/aB3dE6")
     wants = tmp_path / "etc/systemd/system/multi-user.target.wants"
     wants.mkdir(parents=True)
     (wants / "tsgt-client.service").symlink_to("/usr/lib/systemd/system/tsgt-client.service")
@@ -49,14 +49,14 @@ def test_removal_leaves_configuration_and_recordings(installed: Path) -> None:
     """Program and service are gone."""
     call("prerm", "remove", root=installed)
     call("postrm", "remove", root=installed)
-    assert names(installed) == ["etc/tsgt/client.toml", "opt/other/file", "var/lib/tsgt/station1.jsonl"]
+    assert names(installed) == ["etc/tsgt/client.toml", "opt/tsgt-master/file", "var/lib/tsgt/station1.jsonl"]
 
 
 def test_purge_leaves_recordings_alone(installed: Path) -> None:
     """They cannot be made again."""
     call("prerm", "remove", root=installed)
     call("postrm", "purge", root=installed)
-    assert names(installed) == ["opt/other/file", "var/lib/tsgt/station1.jsonl"]
+    assert names(installed) == ["opt/tsgt-master/file", "var/lib/tsgt/station1.jsonl"]
 
 
 def test_purge_leaves_nothing_without_recordings(installed: Path) -> None:
@@ -64,7 +64,7 @@ def test_purge_leaves_nothing_without_recordings(installed: Path) -> None:
     (installed / "var/lib/tsgt/station1.jsonl").unlink()
     call("prerm", "remove", root=installed)
     call("postrm", "purge", root=installed)
-    assert names(installed) == ["opt/other/file"]
+    assert names(installed) == ["opt/tsgt-master/file"]
     assert not (installed / "var/lib/tsgt").exists()
 
 

@@ -184,7 +184,7 @@ def test_upgrade_restarts_what_runs(installed: Guest) -> None:
     installed.output("systemctl stop tsgt-client2 tsgt-client3")  # the package knows nothing of them
     upgrade = f"dpkg -i /stick/{NEWER_BUNDLE} > /root/upgrade.log 2>&1; echo $? > /root/upgraded"
     installed.output(f"systemd-run --quiet sh -c '{upgrade}'")
-    installed.wait("ls -d /opt/tsgt-??????/lib/*/site-packages/scipy | grep -c . | grep -q 2", 600)
+    installed.wait("ls -d /opt/.tsgt/??????/lib/*/site-packages/scipy | grep -c . | grep -q 2", 600)
     last = json.loads(installed.output(recorded))
     installed.wait(
         f"[ $({recorded} | grep -o '\"sequence\":[0-9]*' | cut -d: -f2) -gt {last['sequence']} ]", 60
@@ -194,7 +194,7 @@ def test_upgrade_restarts_what_runs(installed: Guest) -> None:
     assert installed.output("cat /root/upgraded").strip() == "0", installed.output("cat /root/upgrade.log")
     assert installed.output("systemctl is-active tsgt-master tsgt-client").split() == ["active", "active"]
     assert installed.output("tsgt --version").split()[-1] == NEWER
-    assert len(installed.output("ls -d /opt/tsgt-??????").split()) == 1
+    assert len(installed.output("ls -d /opt/.tsgt/??????").split()) == 1
     installation.wait_for_measurements(installed, timeout_s=120)
     newest = installed.output("head -1 $(ls -t /var/lib/tsgt/master-*.jsonl | head -1)")
     assert json.loads(newest)["software"] == f"tsgt {NEWER}"

@@ -8,7 +8,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Final, Literal
 
 from tsgt.setup.configuration import State, compare_configuration
-from tsgt.setup.system import Change, RunCommand, Step, WriteFile
+from tsgt.setup.system import Change, RemoveFile, RunCommand, Step, WriteFile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -190,11 +190,14 @@ def configuration_step(system: System, role: Role, new: str, *, replace: bool) -
 
 def services_step(system: System, role: Role, *, network: bool = False) -> Step:
     """Install unit and udev rules, and let the service start at boot; ``network``: its instrument is in the network."""
-    unit = [*_installed(system, "systemd", role.unit)]
-    if network:
-        text = _content("systemd", "network-instrument.conf")
-        name = f"/etc/systemd/system/{role.unit}.d/network-instrument.conf"
-        unit += [] if system.read(name) == text else [WriteFile(name=name, text=text)]
+    unit: list[Change] = [*_installed(system, "systemd", role.unit)]
+    text = _content("systemd", "network-instrument.conf")
+    name = f"/etc/systemd/system/{role.unit}.d/network-instrument.conf"
+    is_ours = system.read(name) == text
+    if network and not is_ours:
+        unit.append(WriteFile(name=name, text=text))
+    elif is_ours and not network:
+        unit.append(RemoveFile(name=name))
     rules = _installed(system, "udev", "60-tsgt.rules")
     changes: list[Change] = [*unit, *rules]
     if unit:

@@ -85,6 +85,31 @@ class System:
         return [line.split(":") for line in (self.read(name) or "").splitlines() if ":" in line]
 
 
+def _make_folder(folder: Path) -> None:
+    """Make a folder that everybody may enter, whatever the umask of the caller, which sudo keeps."""
+    if not folder.exists():
+        _make_folder(folder.parent)
+        folder.mkdir()
+        folder.chmod(0o755)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RemoveFile:
+    """Remove a file."""
+
+    name: str
+
+    def __str__(self) -> str:
+        return f"remove {self.name}"
+
+    def carry_out(self, system: System) -> None:
+        """Remove it; raises SetupError."""
+        try:
+            system.path(self.name).unlink()
+        except OSError as error:
+            raise SetupError(f"{self.name} cannot be removed: {error.strerror}") from error
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WriteFile:
     """Write a file completely or not at all.
@@ -105,7 +130,7 @@ class WriteFile:
         path = system.path(self.name)
         temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            _make_folder(path.parent)
             descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             with os.fdopen(descriptor, "w", encoding="utf-8") as file:
                 file.write(self.text)
@@ -151,7 +176,7 @@ class RunCommand:
             raise SetupError(self.failure or f"{' '.join(self.arguments)}: {said[0]}")
 
 
-Change = WriteFile | RunCommand
+Change = WriteFile | RemoveFile | RunCommand
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

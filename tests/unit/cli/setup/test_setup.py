@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from typing import TYPE_CHECKING
 
 import pytest
@@ -165,6 +166,30 @@ def test_instrument_in_the_network_is_let_through(tsgt: Tsgt, pi: PiToSetUp) -> 
     assert isinstance(instrument, LeicaInstrumentConfig)
     assert str(instrument.port) == "tcp://10.0.0.5:1212"
     assert (pi.root / "etc/systemd/system/tsgt-client.service.d/network-instrument.conf").exists()
+
+
+def test_instrument_on_a_cable_again_closes_the_network(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """The drop-in of setup goes; one that was edited stays."""
+    pi.instruments["tcp://10.0.0.5:1212"] = 115_200
+    drop_in = pi.root / "etc/systemd/system/tsgt-client.service.d/network-instrument.conf"
+    assert tsgt(*STATION, "--instrument", "tcp://10.0.0.5:1212").code == 0
+    content = drop_in.read_text()
+    by_cable = ("--instrument", pi.root / "dev/serial/by-id" / ADAPTER)
+    assert tsgt(*STATION, *by_cable).code == 0
+    assert not drop_in.exists()
+    drop_in.write_text(f"{content}# of somebody\n")
+    assert tsgt(*STATION, *by_cable).code == 0
+    assert drop_in.exists()
+
+
+def test_folders_can_be_entered_whatever_the_umask(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Sudo keeps the umask of who calls it, and the daemon has to read its configuration."""
+    before = os.umask(0o077)
+    try:
+        assert tsgt(*STATION).code == 0
+    finally:
+        os.umask(before)
+    assert (pi.root / "etc/tsgt").stat().st_mode & 0o777 == 0o755
 
 
 def test_radio_that_does_not_respond_stops_the_setup(tsgt: Tsgt, pi: PiToSetUp) -> None:

@@ -72,8 +72,10 @@ class AlarmLimiter:
         """Take any event of the master; return it as an alarm if it is one and may pass now."""
         if event.event not in self._events:
             return []
-        # The message of a geofence begins with its name.
-        name = event.message.partition(":")[0] if event.event.startswith("geofence_") else ""
+        _, is_fence, change = event.event.partition(
+            "geofence_"
+        )  # its message begins with "geofence NAME CHANGE:"
+        name = event.message.partition(f" {change}:")[0] if is_fence else ""
         key = (event.event, event.station, name)
         subject = self._subjects.get(key)
         if subject is None or (subject.held is None and now_ns >= subject.next_ns):

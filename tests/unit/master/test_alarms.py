@@ -66,6 +66,8 @@ def test_subjects_do_not_suppress_each_other() -> None:
         replace(LOST, station=3),
         EXITED,
         replace(EXITED, message="geofence yard 2 exited: 2 m beyond"),
+        replace(EXITED, message="geofence yard: A exited: 2 m beyond"),
+        replace(EXITED, message="geofence yard: B exited: 2 m beyond"),
     )
     for event in others:
         assert limit.take(event, 0) == [Alarm(event)]

@@ -97,16 +97,16 @@ class Access:
 
     def cookie_valid(self, cookie: str | None) -> bool:
         """Return whether a cookie was given for this access code."""
-        if cookie is None:
+        if cookie is None or not cookie.isascii():
             return False
         nonce, _, signature = cookie.partition(".")
         return hmac.compare_digest(signature.encode(), self._signature(nonce).encode())
 
     def retry_after_s(self, address: str, now_s: float) -> float:
         """Return how long an address has to wait before its next attempt; 0: it may try now."""
-        network = _network(address)
+        own_network = network(address)
         recent = [(at_s, by) for at_s, by in self._failures if now_s - at_s < ATTEMPT_SPAN_S]
-        own = [at_s for at_s, by in recent if by == network]
+        own = [at_s for at_s, by in recent if by == own_network]
         if len(own) >= ATTEMPTS_PER_ADDRESS:
             return own[-ATTEMPTS_PER_ADDRESS] + ATTEMPT_SPAN_S - now_s
         if len(recent) >= ATTEMPTS:
@@ -117,16 +117,18 @@ class Access:
         """Return whether a code is right; False as well, without a look at it, when the address has to wait."""
         if self.retry_after_s(address, now_s) > 0:
             return False
-        right = hmac.compare_digest(hashlib.sha256(code.strip().encode()).digest(), self._code)
+        # Also of what is no text: half a surrogate pair, from a form or an address.
+        given = hashlib.sha256(code.strip().encode(errors="surrogatepass")).digest()
+        right = hmac.compare_digest(given, self._code)
         if not right:
-            self._failures.append((now_s, _network(address)))
+            self._failures.append((now_s, network(address)))
         return right
 
     def _signature(self, nonce: str) -> str:
         return hmac.new(self._key, nonce.encode(), hashlib.sha256).hexdigest()
 
 
-def _network(address: str) -> str:
+def network(address: str) -> str:
     """Return what counts as one address: with IPv6 a whole network, within which one computer has as many as it likes."""
     known = _address(address)
     if isinstance(known, ipaddress.IPv6Address):

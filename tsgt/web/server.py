@@ -38,6 +38,9 @@ BODY_TIMEOUT_S = 3.0
 WRITE_TIMEOUT_S = 5.0
 """A browser that has taken nothing for this long is disconnected."""
 
+BACKLOG = 100
+"""Connections that wait for their acceptance."""
+
 SEND_BUFFER_BYTES = 32_768
 """Of a reader's socket: what waits in larger ones would be old when it arrives."""
 
@@ -92,6 +95,7 @@ class Page:
     foxglove: FoxgloveServer | None = None
     """Serves Foxglove apps; None: they are not served."""
     readers: int = 0
+    connections: Connections = field(default_factory=Connections)
     _site: Site = field(init=False)
     _files: dict[str, bytes] = field(init=False)
 
@@ -125,6 +129,7 @@ class Page:
         handler: Callable[[web.Request], Awaitable[web.StreamResponse]],
     ) -> web.StreamResponse:
         """Refuse what does not come from this page, and add the headers that protect it."""
+        self.connections.headers_complete(request)
         try:
             self._check(request)
             response = await handler(request)
@@ -188,12 +193,14 @@ class Page:
             response = self._login_form(429, f"Too many wrong codes. Wait {wait_s:.0f} s.")
             response.headers["Retry-After"] = str(max(1, round(wait_s)))
             return response
+        if request.content_type != "application/x-www-form-urlencoded":
+            raise web.HTTPBadRequest
         try:
             async with asyncio.timeout(BODY_TIMEOUT_S):
                 form = await request.post()
         except TimeoutError:
             raise web.HTTPRequestTimeout from None
-        except ValueError:
+        except (ValueError, LookupError):  # LookupError: an unknown charset
             raise web.HTTPBadRequest from None
         code = form.get("code", "")
         if not isinstance(code, str) or len(code) > MAX_CODE_CHARACTERS:
@@ -339,29 +346,31 @@ async def serve(page: Page, opened: Callable[[str], None]) -> None:
     context = _tls(settings)
     await runner.setup()
     try:
-        connections = Connections(runner)
-        try:
-            server = await asyncio.get_running_loop().create_server(
-                connections.protocol,
-                settings.address,
-                settings.port,
-                ssl=context,
-                ssl_handshake_timeout=BODY_TIMEOUT_S if context else None,
-            )
-        except OSError as error:
-            raise StreamError(
-                f"{settings.address} port {settings.port}: cannot listen there ({error.strerror or error}); give the "
-                "right --listen, or another --port"
-            ) from error
-        async with server:
-            address, port = server.sockets[0].getsockname()[:2]
+        assert runner.server is not None  # noqa: S101 (the runner is set up)
+        with _listener(settings) as listener:
+            address, port = listener.getsockname()[:2]
             host = f"[{address}]" if ":" in address else address
             url = f"{'https' if context else 'http'}://{host}:{port}/"
             log.info("web_opened", url=url, code=settings.access is not None)
             opened(url)
-            await asyncio.Event().wait()
+            await page.connections.accept(listener, runner.server, context)
     finally:
         await runner.cleanup()
+
+
+def _listener(settings: Settings) -> socket.socket:
+    """Return a listening socket; raises StreamError."""
+    try:
+        found = socket.getaddrinfo(settings.address, settings.port, type=socket.SOCK_STREAM)
+        family, _, _, _, address = found[0]  # of an address there is one
+        listener = socket.create_server(address, family=family, backlog=BACKLOG)
+    except OSError as error:
+        raise StreamError(
+            f"{settings.address} port {settings.port}: cannot listen there ({error.strerror or error}); give the "
+            "right --listen, or another --port"
+        ) from error
+    listener.setblocking(False)
+    return listener
 
 
 def _silent_logger() -> logging.Logger:

@@ -27,7 +27,16 @@ from tsgt.web.figures import figures
 from tsgt.web.frames import add, inverse, product, rotate, subtract
 from tsgt.web.history import EVENTS, DelayEstimate, History, Residuals, Share, Trail
 from tsgt.web.stations import rounded
-from tsgt.web.verdict import POSE_AGE_LIMIT_S, Finding, Hold, Level, PoseFacts, StreamFacts, judge
+from tsgt.web.verdict import (
+    POSE_AGE_LIMIT_S,
+    Finding,
+    Hold,
+    Level,
+    PoseFacts,
+    StreamFacts,
+    judge,
+    stream_findings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -222,6 +231,10 @@ class MissionState:
         """The set-up in force; None while it is unknown."""
         return self._setup
 
+    def live(self, now_s: float) -> bool:
+        """Return whether the stream tells of the present: it is neither lost nor silent nor late."""
+        return not stream_findings(self._stream(now_s))
+
     def sight_points(self, now_s: float) -> dict[int, Vector3]:
         """Return where each station has just measured its prism, by its number."""
         return {
@@ -296,13 +309,15 @@ class MissionState:
             ],
         }
 
-    def _findings(self, now_s: float) -> list[Finding]:
-        stream = StreamFacts(
+    def _stream(self, now_s: float) -> StreamFacts:
+        return StreamFacts(
             connected=self._connected,
             problem=self._problem,
             silence_s=now_s - self._line_s,
             delay_s=self._delay.delay_s,
         )
+
+    def _findings(self, now_s: float) -> list[Finding]:
         conditions = self._conditions(now_s)
         radio_failure = self._standing.radio_failure
         pose, limits = self._live, self._setup.limits if self._setup is not None else None
@@ -326,7 +341,7 @@ class MissionState:
         ]
         uncalibrated = None if self._status is None else self._status.no_poses
         waiting_for = uncalibrated or radio_failure or findings.waiting_for(conditions)
-        return judge(stream, facts, waiting_for, others)
+        return judge(self._stream(now_s), facts, waiting_for, others)
 
     def _conditions(self, now_s: float) -> dict[int, stations.Condition]:
         if self._status is None:

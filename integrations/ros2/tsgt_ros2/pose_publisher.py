@@ -103,7 +103,7 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
             return
         self._pose = pose
         position, orientation = pose.position_m, pose.orientation_xyzw
-        stale = pose.age_s() > default_max_age_s(pose)
+        stale = self._stale(pose)
         self._stale_poses += stale
         if not pose.valid or stale or position is None or orientation is None:
             return
@@ -125,6 +125,9 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
             _set_xyz(odometry.twist.twist.linear, rotated_back(pose.velocity_mps, orientation))
             _set_xyz(odometry.twist.twist.angular, pose.angular_velocity_radps)
             self._odometry.publish(odometry)
+
+    def _stale(self, pose: Pose) -> bool:
+        return pose.age_s() > default_max_age_s(pose, None if self._setup is None else self._setup.lag_s)
 
     def _take_measurement(self, measurement: Measurement) -> None:
         point = None if self._setup is None else measured_point(measurement, self._setup)
@@ -177,7 +180,7 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
                 why = f"no line for {silent_s:.0f} s" if self._arrived_ns else "no line yet"
             statuses = [_stream_diagnosis(self.source, why)]
             if self._pose is not None:
-                statuses.append(_pose_diagnosis(self._pose, self._stale_poses))
+                statuses.append(_pose_diagnosis(self._pose, self._stale_poses, stale=self._stale(self._pose)))
             if self._status is not None:
                 statuses += [_station_diagnosis(station) for station in self._status.stations]
         if why:
@@ -245,8 +248,10 @@ def _stream_diagnosis(source: str, problem: str) -> Any:
     return _diagnosis("stream", level, problem or "connected", source=source)
 
 
-def _pose_diagnosis(pose: Pose, stale_poses: int) -> Any:
-    if not pose.valid:
+def _pose_diagnosis(pose: Pose, stale_poses: int, *, stale: bool) -> Any:
+    if stale:
+        level, message = DiagnosticStatus.STALE, f"{pose.age_s():.1f} s old"
+    elif not pose.valid:
         level, message = DiagnosticStatus.ERROR, f"invalid: {pose.reason}"
     elif pose.quality == "degraded":
         level, message = DiagnosticStatus.WARN, f"degraded by {', '.join(pose.degraded_by)}"

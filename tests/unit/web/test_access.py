@@ -74,8 +74,13 @@ def test_cookie_is_only_that_of_the_code(locked: Access) -> None:
     assert not Access("another code").cookie_valid(cookie)
     assert not locked.cookie_valid(cookie[:-1] + ("0" if cookie[-1] != "0" else "1"))
     assert not locked.cookie_valid("0" + cookie)
-    for nonsense in (None, "", ".", "é.ü", "x" * 5000):
+    for nonsense in (None, "", ".", "é.ü", "\udcff.\udcff", "x" * 5000):
         assert not locked.cookie_valid(nonsense)
+
+
+def test_code_that_is_no_text_is_a_wrong_one(locked: Access) -> None:
+    """Bytes that are no UTF-8 arrive as surrogates."""
+    assert not locked.attempt("correct horse\udcff", "192.0.2.1", 0.0)
 
 
 def test_wrong_codes_lock_an_address_for_a_while() -> None:

@@ -154,6 +154,27 @@ def test_stale_pose_is_no_pose() -> None:
     assert stale["verdict"]["words"] == "NO POSE"
 
 
+def test_pose_of_a_late_stream_is_no_pose() -> None:
+    """Lines that arrive 10 s late are no live view, however valid their poses: the robot is taken away."""
+    state = MissionState("poses.sock")
+    feed = Feed(state, lambda _: True)
+    state.connected(0.0)
+    state.line(encode_line(SETUP), 0.0)
+
+    def sent(at_s: float, now_s: float) -> list[str]:
+        """Return the topics of the messages of a pose, after a status that is as old."""
+        for record in (status(at_s), pose(at_s)):
+            line = encode_line(record)
+            state.line(line, now_s)
+            messages = list(feed.line(line, now_s))
+        return [each.topic for each in messages]
+
+    assert sent(0.0, 0.0) == ["/tsgt/pose", "/tf", "/tsgt/scene"]
+    assert sent(1.0, 11.0) == ["/tsgt/scene"]
+    assert said(feed, state, 11.0)["verdict"]["words"] == "STREAM STOPPED"
+    assert sent(12.0, 12.0) == ["/tsgt/pose", "/tf", "/tsgt/scene"]
+
+
 def said(feed: Feed, state: MissionState, now_s: float) -> dict[str, Any]:
     """Return what the channel of the mission says."""
     messages = {each.topic: each.data for each in feed.view(state.view(now_s), now_s)}

@@ -10,6 +10,7 @@ import shutil
 import socket
 import ssl
 import subprocess
+from contextlib import suppress
 from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,6 @@ from tsgt.web import connections, server
 from tsgt.web.access import SECURITY_HEADERS, Access
 
 if TYPE_CHECKING:
-    from pathlib import Path
 
     import aiohttp
 
@@ -191,18 +191,28 @@ async def test_right_cookie_does_not_help_a_foreign_site(access: Access) -> None
             assert got.status == 421
 
 
-@pytest.mark.skipif(OPENSSL is None, reason="openssl, which makes the certificate, is not installed")
-def test_tls_with_a_certificate_of_ones_own(tmp_path: Path, access: Access) -> None:
-    """The cookie is then for encrypted connections only, and plain HTTP gets nothing."""
-    certificate, key = tmp_path / "robot.pem", tmp_path / "robot.key"
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Return the settings for TLS with a certificate of one's own."""
+    if OPENSSL is None:
+        pytest.skip("openssl, which makes the certificate, is not installed")
+    folder = tmp_path_factory.mktemp("certificate")
+    files = {"certificate": folder / "robot.pem", "key": folder / "robot.key"}
     request = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=robot -addext subjectAltName=IP:127.0.0.1"
     subprocess.run(
-        [str(OPENSSL), *request.split(), "-out", certificate, "-keyout", key], check=True, capture_output=True
+        [OPENSSL, *request.split(), "-out", files["certificate"], "-keyout", files["key"]],
+        check=True,
+        capture_output=True,
     )
-    trusting = ssl.create_default_context(cafile=str(certificate))
+    return files
+
+
+def test_tls_with_a_certificate_of_ones_own(certificate: dict[str, Any], access: Access) -> None:
+    """The cookie is then for encrypted connections only, and plain HTTP gets nothing."""
+    trusting = ssl.create_default_context(cafile=str(certificate["certificate"]))
 
     async def check() -> None:
-        async with served(mission(), access, certificate=certificate, key=key) as url, client() as session:
+        async with served(mission(), access, **certificate) as url, client() as session:
             assert url.startswith("https://")
             headers = {"Origin": url.rstrip("/")}
             async with session.post(
@@ -218,12 +228,97 @@ def test_tls_with_a_certificate_of_ones_own(tmp_path: Path, access: Access) -> N
 
 
 @in_real_time
+async def test_unfinished_handshakes_are_limited(
+    monkeypatch: pytest.MonkeyPatch, certificate: dict[str, Any]
+) -> None:
+    """They count as connections, as each takes memory, and have some seconds."""
+    monkeypatch.setattr(connections, "HANDSHAKE_TIMEOUT_S", 0.5)
+    hello = b"\x16\x03\x01\x40\x00\x01\x00\x3f\xfc" + b"x" * 16_000  # not complete
+    async with served(mission(), **certificate) as url:
+        sockets = [await connected(url) for _ in range(100)]
+        for each in sockets:
+            with suppress(ConnectionError):
+                each.send(hello)
+        await asyncio.sleep(0.2)
+        assert sum(not closed(each) for each in sockets) <= connections.MAX_CONNECTIONS_PER_ADDRESS
+        async with asyncio.timeout(5):
+            for each in sockets:
+                with suppress(ConnectionError):
+                    assert await asyncio.get_running_loop().sock_recv(each, 1) == b""
+        async with client() as session, session.get(url, ssl=False) as page:  # there is room again
+            assert page.status == 200
+    for each in sockets:
+        each.close()
+
+
+@in_real_time
+async def test_ipv6_connections_are_counted_by_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One computer has as many addresses in it as it likes."""
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS_PER_ADDRESS", 1)
+    loop = asyncio.get_running_loop()
+    accept, peers = loop.sock_accept, iter(["2001:db8::1", "2001:db8::2", "2001:db8:0:1::1"])
+
+    async def accept_from_afar(listener: socket.socket) -> tuple[socket.socket, tuple[str, int, int, int]]:
+        return (await accept(listener))[0], (next(peers), 1024, 0, 0)
+
+    monkeypatch.setattr(loop, "sock_accept", accept_from_afar)
+    async with served(mission()) as url:
+        sockets = [await connected(url) for _ in range(3)]
+        await asyncio.sleep(0.2)
+        assert [closed(each) for each in sockets] == [False, True, False]
+    for each in sockets:
+        each.close()
+
+
+@in_real_time
 async def test_wrong_codes_are_limited() -> None:
     """Five a minute; then not even the right one is looked at."""
     async with served(mission(), Access(CODE)) as url, client() as session:
         statuses = [await login(session, url, f"guess {i}") for i in range(7)]
         assert statuses == [403, 403, 403, 403, 403, 429, 429]
         assert await login(session, url) == 429
+
+
+FORM = "application/x-www-form-urlencoded"
+PART = b'--b\r\nContent-Disposition: form-data; name="code"\r\nContent-%s: nope\r\n\r\nx\r\n--b--\r\n'
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "expected"),
+    [
+        (f"{FORM}; charset=nope", b"code=x", b"400"),
+        (f"{FORM}; charset=hex", b"code=x", b"400"),
+        (f"{FORM}; charset=\xff", b"code=x", b"400"),
+        (f"{FORM}; charset=utf-7", b"code=+2AA-", b"403"),  # half a surrogate pair
+        (FORM, b"code=%ff", b"403"),
+        (FORM, b"code=\xff", b"400"),
+        ("multipart/form-data", b"code=x", b"400"),
+        ("multipart/form-data; boundary=b", PART % b"Transfer-Encoding", b"400"),
+        ("multipart/form-data; boundary=b", PART % b"Encoding", b"400"),
+        ("/", b"code=x", b"400"),
+    ],
+)
+@in_real_time
+async def test_unreadable_form_is_no_failure(kind: str, body: bytes, expected: bytes) -> None:
+    """It is refused, and no failure is logged: they could fill the disk."""
+    with capture_logs() as logged:
+        async with served(mission(), Access(CODE)) as url:
+            head = f"POST /login HTTP/1.1\r\nHost: {host(url)}\r\nOrigin: http://{host(url)}\r\n"
+            head += f"Content-Type: {kind}\r\nContent-Length: {len(body)}\r\n\r\n"
+            answer = await raw(url, head.encode("latin-1") + body)
+    assert answer.split()[1] == expected
+    assert "web_request_failed" not in {each["event"] for each in logged}
+
+
+@pytest.mark.parametrize("cookie", [b"a.\xff\xfe", b"\xff.a", b"a.\xc3\xa4", b'"\\377.\\377"'])
+@in_real_time
+async def test_cookie_that_is_no_text_is_no_failure(access: Access, cookie: bytes) -> None:
+    """It is no cookie."""
+    with capture_logs() as logged:
+        async with served(mission(), access) as url:
+            head = f"GET /stream HTTP/1.1\r\nHost: {host(url)}\r\nCookie: tsgt_web=".encode()
+            assert (await raw(url, head + cookie + b"\r\n\r\n")).split()[1] == b"401"
+    assert "web_request_failed" not in {each["event"] for each in logged}
 
 
 @pytest.mark.parametrize(
@@ -256,12 +351,12 @@ async def test_huge_or_malformed_request_is_refused(
 
 @in_real_time
 async def test_slow_request_is_disconnected(monkeypatch: pytest.MonkeyPatch, access: Access) -> None:
-    """One that sends its headers a byte at a time, or nothing, or no body."""
+    """One that sends its headers a byte at a time, or nothing, or empty lines before them, or no body."""
     monkeypatch.setattr(connections, "REQUEST_TIMEOUT_S", 0.2)
     monkeypatch.setattr(server, "BODY_TIMEOUT_S", 0.2)
     begun = b"POST /login HTTP/1.1\r\nHost: HOST\r\nOrigin: http://HOST\r\nContent-Length: 20\r\n\r\nco"
     async with served(mission(), access) as url, asyncio.timeout(3):
-        for start in (b"", b"GET / HT", begun):
+        for start in (b"", b"GET / HT", b"\r\n\r\n", b"\r\n\r\nGET / HT", begun):
             await raw(url, start.replace(b"HOST", host(url).encode()))
 
 

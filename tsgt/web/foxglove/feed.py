@@ -1,7 +1,7 @@
 """Which messages follow from the stream: with each line, and with each view of the page. Sans-I/O.
 
-Times of messages are those of the master's clock. Only a valid pose becomes a pose, a frame and a robot in the scene; the channel
-of the mission says five times a second whether the pose is valid now, and why it is not.
+Times of messages are those of the master's clock. Only a valid pose of a live stream becomes a pose, a frame and a robot in the scene; the
+channel of the mission says five times a second whether the pose is valid now, and why it is not.
 """
 
 from __future__ import annotations
@@ -118,7 +118,8 @@ class Feed:
     def _pose(self, record: PoseRecord, now_s: float) -> Iterator[Message]:
         stamp_ns = self.now_ns(now_s) or record.stamp_ns
         position, orientation = record.position_m, record.orientation_xyzw
-        if not record.valid or position is None or orientation is None:
+        live = self._state.live(now_s)  # else the pose is one of before, however valid
+        if not (live and record.valid) or position is None or orientation is None:
             yield Message(channels.SCENE, stamp_ns, scene.no_robot(record.frame, self._last, stamp_ns))
             return
         self._last, rotation = self._state.robot(position, orientation)

@@ -6,7 +6,8 @@ import { drawChart } from "/chart.js";
 
 const SILENCE_LIMIT_MS = 1500; // messages come every 200 ms
 const LATE_LIMIT_MS = 1500;
-const RECONNECT_MS = 4000; // a connection that gives nothing for this long is replaced
+const RECONNECT_MS = 4000; // a connection that gives nothing in time for this long is replaced
+const REFUSED_MS = 1000; // then one that was refused is tried again
 const CHECK_MS = 200;
 const CLOCK_SKEW = 1e-4;
 const MAX_TRAIL = 1500, MAX_RESIDUALS = 600, MAX_EVENTS = 100;
@@ -24,8 +25,9 @@ const replaying = document.body.dataset.replay === "yes";
 const map = new MissionMap(find("map"));
 
 let source = null;
-let opened_ms = 0;
-let received_ms = -Infinity, received_wall_ms = 0;
+let opened_ms = 0; // at the earliest: the newest connection was made after it
+let received_ms = -Infinity, timely_ms = -Infinity; // the last message, and the last one that was not late
+let clocks_ms = 0, received_clocks_ms = 0; // what clocks() was at the last message or connection, and at the last message
 let least_offset_ms = Infinity, late_ms = 0;
 let view = null, residuals = [], events = [];
 let shown = "", sounded = 0, audio = null;
@@ -33,30 +35,52 @@ let playing = { at_s: 0, speed: 1, length_s: 0, start_ms: 0 }, seeking = false;
 
 // --- connection ------------------------------------------------------------------------------------------------
 
+// It jumps when the device sleeps, as performance.now() then stands still on many; and when the wall clock is set.
+const clocks = () => Date.now() - performance.now();
+
+function opening() {
+  opened_ms = performance.now();
+  clocks_ms = clocks();
+}
+
 function connect(query = "") {
   if (source) source.close();
-  opened_ms = performance.now();
+  opening();
   const own = source = new EventSource(`/stream${query}`);
   own.onmessage = (event) => { if (own === source) take(JSON.parse(event.data)); };
   own.onerror = () => {
-    if (own !== source || own.readyState !== EventSource.CLOSED) return;
+    if (own !== source) return;
+    if (own.readyState !== EventSource.CLOSED) { opening(); return; } // by the browser itself
     source = null; // refused: the code has changed, or too many readers
     fetch("/", { method: "HEAD" }).then((response) => { if (response.status === 401) location.assign("/"); }, () => {});
   };
+}
+
+// What was received until now says nothing of the present.
+function reconnect() {
+  late_ms = 0;
+  received_ms = Math.min(received_ms, performance.now() - SILENCE_LIMIT_MS - 1);
+  connect(query());
 }
 
 const query = () => replaying ? `?at=${playing.at_s.toFixed(1)}&speed=${playing.speed}` : "";
 
 function take(message) {
   const now_ms = performance.now();
+  // The device has slept: this message may have waited in a buffer meanwhile, and so may those after it.
+  if (Math.abs(clocks() - clocks_ms) > SILENCE_LIMIT_MS) {
+    if (now_ms - opened_ms > RECONNECT_MS) reconnect();
+    return;
+  }
   const offset_ms = now_ms - 1000 * message.sent_s;
   const elapsed_ms = Number.isFinite(received_ms) ? now_ms - received_ms : 0;
-  // The robot's computer was restarted: its clock began again.
-  if (message.first && offset_ms - least_offset_ms > 60000) least_offset_ms = Infinity;
   least_offset_ms = Math.min(least_offset_ms + CLOCK_SKEW * elapsed_ms, offset_ms);
+  // The robot's clock stood still while its computer was suspended, or began again: the first message is no older than its connection.
+  if (message.first) least_offset_ms = Math.max(least_offset_ms, opened_ms - 1000 * message.sent_s);
   late_ms = offset_ms - least_offset_ms;
   received_ms = now_ms;
-  received_wall_ms = Date.now();
+  if (late_ms <= LATE_LIMIT_MS) timely_ms = now_ms;
+  clocks_ms = received_clocks_ms = clocks();
   view = message.view;
   if (message.setup !== undefined) { map.setup = message.setup; map.fitted = map.fitted && !message.first; }
   map.trail = appended(message.first ? [] : map.trail, message.trail, MAX_TRAIL);
@@ -78,7 +102,7 @@ function verdict() {
   const now_ms = performance.now();
   const silence_ms = now_ms - received_ms;
   if (!view) return { words: "NO CONNECTION", cause: "waiting for the first message" };
-  const slept = Math.abs((Date.now() - received_wall_ms) - silence_ms) > SILENCE_LIMIT_MS;
+  const slept = Math.abs(clocks() - received_clocks_ms) > SILENCE_LIMIT_MS;
   if (silence_ms > SILENCE_LIMIT_MS || slept) {
     return { words: "NO CONNECTION", cause: `nothing received for ${Math.max(silence_ms / 1000, 1).toFixed(0)} s: what is shown is old` };
   }
@@ -88,8 +112,7 @@ function verdict() {
 
 function check() {
   const now_ms = performance.now();
-  const quiet = now_ms - Math.max(received_ms, opened_ms) > RECONNECT_MS;
-  if (!source ? now_ms - opened_ms > 1000 : quiet || late_ms > RECONNECT_MS) { late_ms = 0; received_ms = Math.min(received_ms, now_ms - SILENCE_LIMIT_MS - 1); connect(query()); }
+  if (now_ms - Math.max(timely_ms, opened_ms) > (source ? RECONNECT_MS : REFUSED_MS)) reconnect();
   if (!view || verdict() !== view.verdict) show(); // else the last message has been shown
 }
 

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.hardware.radios import MS
+from harness.hardware.radios import MS, running_timeline
 from harness.radio.client import START_NS, field_day
 from harness.radio.scripted_master import KEY, TIMING, ScriptedMaster
 from structlog.testing import capture_logs
@@ -16,7 +16,8 @@ from unit.station.test_daemon import client_status
 from tsgt.clock import UnixTimeline
 from tsgt.config import SuperframeConfig
 from tsgt.errors import RecordingError
-from tsgt.radio.superframe.wire import RESTART_SKIP, CommandResponse, EncodedCommand
+from tsgt.radio.superframe import SuperframeStation
+from tsgt.radio.superframe.wire import GRANT_BYTES, RESTART_SKIP, CommandResponse, EncodedCommand
 from tsgt.recording import RecordingWriter, read_lines
 from tsgt.recording.journal import load_journal
 from tsgt.simulation.kernel import VirtualClock
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from harness.radio.scripted_master import ReceivedMessage
 
     from tsgt.model import PolarMeasurement
+    from tsgt.radio.superframe import InstrumentState
 
 SUPERFRAME = SuperframeConfig(kind="superframe")
 
@@ -279,6 +281,31 @@ async def test_reply_starts_at_slot(tmp_path: Path) -> None:
         slot_ns = air.master.beacon_done_ns - 67_000 + TIMING.turnaround_ns
         assert abs(began_ns - slot_ns) < MS
         air.master.take(packet.payload)
+
+
+async def test_reply_composed_too_slowly_is_not_transmitted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would collide with the next slot; the next reply has its measurements."""
+    timeline, compose = running_timeline(), SuperframeStation.compose
+
+    def slow(station: SuperframeStation, state: InstrumentState, now_ns: int) -> bytes | None:
+        reply = compose(station, state, now_ns)
+        timeline.advance(100 * MS)
+        return reply
+
+    async with superframe_day(tmp_path) as (_, air):
+        await air.frames(5.0)
+        air.master.grant = GRANT_BYTES.index(26)
+        with monkeypatch.context() as patch, capture_logs() as logs:
+            patch.setattr(SuperframeStation, "compose", slow)
+            assert await air.frame() is None
+        answered = await air.frame()
+        status = await client_status(tmp_path / "client.sock")
+    assert [(entry["event"], entry["missed_slots"]) for entry in logs] == [("slot_missed", 1)]
+    assert status["missed_slots"] == 1
+    assert answered is not None
+    assert answered.sequences
 
 
 async def test_first_sequence_is_synced_before_its_use(

@@ -7,6 +7,7 @@ received measurements that are not recorded yet, to publish each one once.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import Counter
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING
@@ -76,14 +77,38 @@ class SequenceSet:
         if number in self:
             self._gaps.insert(bisect_right(self._gaps, number, key=_start), range(number, number + 1))
 
+    def truncate(self, stop: int) -> None:
+        """Remove all numbers from this one on."""
+        self.highest = min(self.highest, stop - 1)
+        self._gaps = [rest for gap in self._gaps if (rest := range(gap.start, min(gap.stop, stop)))]
+
 
 @dataclass(slots=True)
 class _Stream:
-    """Numbers of one stream id: received, recorded, and received but not recorded."""
+    """Numbers of one stream id: received, recorded, and received but not recorded.
 
-    received: SequenceSet
-    recorded: SequenceSet
+    ``reused``: numbers of measurements of an earlier run that are not recorded yet, which the present run uses again.
+    """
+
+    received: SequenceSet = field(default_factory=lambda: SequenceSet(0))
+    recorded: SequenceSet = field(default_factory=lambda: SequenceSet(0))
     pending: set[int] = field(default_factory=set)
+    reused: Counter[int] = field(default_factory=Counter)
+    first_sequence: int | None = None
+
+    def begin_run(self, first_sequence: int) -> None:
+        """Take the first number of another run of the client.
+
+        As a rule it is above all others. But if the station has lost more numbers than a restart skips, it uses those from
+        ``first_sequence`` on again, for other measurements. Those below are the ones that it has in its journal, and those
+        that it skips. This holds if each run joins: of one in between that did not, numbers received before count as received.
+        """
+        self.first_sequence = first_sequence
+        self.received.truncate(first_sequence)
+        self.recorded.truncate(first_sequence)
+        reused = {number for number in self.pending if number >= first_sequence}
+        self.pending -= reused
+        self.reused.update(reused)
 
 
 class ReceiveWindow:
@@ -91,8 +116,7 @@ class ReceiveWindow:
 
     def __init__(self) -> None:
         self.stream_id: int | None = None
-        self._first_sequence = 0
-        self._current = _Stream(SequenceSet(0), SequenceSet(0))
+        self._current = _Stream()
         self._streams: dict[int, _Stream] = {}
         self._replies: dict[int, tuple[int, ...]] = {}
 
@@ -118,14 +142,9 @@ class ReceiveWindow:
     def join(self, request: JoinRequest) -> None:
         """Take a join request: the stream may be another one, or have lost numbers at its end."""
         if request.stream_id != self.stream_id:
-            self._switch_stream(request)
-        elif (
-            request.first_sequence != self._first_sequence
-            and request.first_sequence <= self._current.received.highest
-        ):
-            # The station lost more than it skipped and reuses numbers.
-            self._reset(request)
-        self._first_sequence = request.first_sequence
+            self._switch_stream(request.stream_id)
+        if request.first_sequence != self._current.first_sequence:
+            self._current.begin_run(request.first_sequence)
         skipped = range(max(request.first_sequence - RESTART_SKIP, 0), request.first_sequence)
         for numbers in (self._current.received, self._current.recorded):
             numbers.add(range(request.oldest))
@@ -135,20 +154,12 @@ class ReceiveWindow:
             if number >= request.oldest and number not in skipped:
                 self._current.recorded.remove(number)
 
-    def _switch_stream(self, request: JoinRequest) -> None:
+    def _switch_stream(self, stream_id: int) -> None:
         """Continue a remembered stream, or start a new one."""
-        self.stream_id = request.stream_id
-        known = self._streams.pop(request.stream_id, None)
-        if known is None or request.first_sequence <= known.received.highest:
-            self._reset(request)
-        else:
-            self._current = self._streams[request.stream_id] = known
+        self.stream_id = stream_id
+        self._current = self._streams[stream_id] = self._streams.pop(stream_id, _Stream())
         while len(self._streams) > MAX_STREAMS:
             del self._streams[next(iter(self._streams))]
-
-    def _reset(self, request: JoinRequest) -> None:
-        self._current = _Stream(SequenceSet(request.oldest), SequenceSet(request.oldest))
-        self._streams[request.stream_id] = self._current
 
     def unwrap(self, low_bits: int, request: JoinRequest | None = None) -> int:
         """Return the number with these low bits that is nearest to the highest one received or in the join request."""
@@ -187,7 +198,9 @@ class ReceiveWindow:
     def _pending(self, numbers: Iterable[int]) -> Iterable[tuple[int, _Stream]]:
         for number in numbers:
             for stream in self._streams.values() or (self._current,):
-                if number in stream.pending:
+                if number in stream.reused:  # the disk gets them in the order in which they were received
+                    stream.reused -= Counter((number,))
+                elif number in stream.pending:
                     stream.pending.remove(number)
                     yield number, stream
 

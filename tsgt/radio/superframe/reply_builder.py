@@ -116,13 +116,16 @@ class ReplyBuilder:
         urgent: list[StampedMeasurement] = []
 
         def add(candidates: Iterable[QueuedMeasurement], count: int) -> None:
-            for queued in islice(filter(session.can_timestamp, candidates), count):
+            for queued in islice(candidates, count):
                 stamped = session.timestamped(queued, slot_ns, urgent[0] if urgent else None)
-                if stamped is not None and (not urgent or queued.sequence < urgent[-1].queued.sequence):
+                if stamped is None:
+                    session.untimed.append(queued)
+                elif not urgent or queued.sequence < urgent[-1].queued.sequence:
                     urgent.append(stamped)
 
-        add(self._queue.newest_first(), max_measurements)
-        add(self._queue.oldest_first(), 1)
+        session.untimed.clear()
+        add(self._queue.newest_first(session.reach), max_measurements)
+        add(self._queue.oldest_first(session.reach), 1)
         short = len(self._queue) <= MAX_SHORT_QUEUE
         limit = MAX_SKIPPED_REPLIES if short else MAX_SKIPPED_REPLIES_OF_BACKLOG
         if short:

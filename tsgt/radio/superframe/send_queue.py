@@ -6,14 +6,18 @@ The queue outlives the masters that it is delivered to: each continues with what
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise, takewhile
+from itertools import pairwise
+from math import inf
+from operator import attrgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.radio.superframe.wire import RESTART_SKIP, quality_bound_us
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from tsgt.model import Status
 
@@ -23,6 +27,14 @@ _MAX_QUALITY = 15
 _SEQUENCE_BITS = 8
 
 Gaps = tuple[tuple[int, int], ...]
+
+Reach = Callable[[str], tuple[float, float]]
+"""Returns the first and last time, on the clock of a boot, at which a measurement can be timed for a master."""
+
+UNLIMITED_REACH = -inf, inf
+NO_REACH = inf, -inf
+
+_start = attrgetter("start")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,15 +76,23 @@ class PendingRange(NamedTuple):
 class SendQueue:
     """Measurements that are not acknowledged, by sequence number.
 
-    ``first_sequence`` is the first number of this run of the client, and ``backlog`` what earlier runs left, oldest first.
+    Each reply searches the queue, and would be late for its slot if a search of a long queue took longer. The numbers are
+    therefore kept as runs, consecutive ones of the same boot. A run is in the order of time, so the part of it that can be
+    timed for a master is found by bisection.
+
+    ``first_sequence`` is the first number of this run of the client, and ``backlog`` what earlier runs left, below it.
     ``dropped_through`` is the highest number dropped because the queue was full; -1: none.
     """
 
     def __init__(self, first_sequence: int, backlog: Iterable[QueuedMeasurement] = ()) -> None:
         self.first_sequence = first_sequence
-        self._queue = {queued.sequence: queued for queued in backlog}
-        self._next = first_sequence
         self.dropped_through = -1
+        self._queue: dict[int, QueuedMeasurement] = {}
+        self._runs: list[range] = []
+        self._next = 0
+        for _, queued in sorted({each.sequence: each for each in backlog}.items()):
+            self.add(queued)
+        self._next = max(self._next, first_sequence)
 
     def __len__(self) -> int:
         return len(self._queue)
@@ -80,56 +100,80 @@ class SendQueue:
     @property
     def oldest(self) -> int:
         """The lowest queued number, or the next to be added."""
-        return next(iter(self._queue), self._next)
+        return self._runs[0].start if self._runs else self._next
 
     def add(self, queued: QueuedMeasurement) -> None:
         """Append a measurement with the highest sequence number; drop the oldest beyond :data:`QUEUE_CAPACITY`."""
         if queued.sequence < self._next:
             raise ValueError(f"measurement {queued.sequence} comes after {self._next - 1}")
+        newest = self._runs[-1] if self._runs else range(0)
+        if newest.stop == queued.sequence and newest and self._queue[newest.start].boot == queued.boot:
+            self._runs[-1] = range(newest.start, queued.sequence + 1)
+        else:
+            self._runs.append(range(queued.sequence, queued.sequence + 1))
         self._queue[queued.sequence] = queued
         self._next = queued.sequence + 1
         if len(self._queue) > QUEUE_CAPACITY:
             self.dropped_through = self.oldest
-            del self._queue[self.dropped_through]
+            self.remove((self.dropped_through,))
 
-    def oldest_first(self) -> Iterator[QueuedMeasurement]:
-        """Iterate over the queue, which must not change meanwhile."""
-        return iter(self._queue.values())
+    def oldest_first(self, reach: Reach = lambda _: UNLIMITED_REACH) -> Iterator[QueuedMeasurement]:
+        """Iterate over what is within reach; the queue must not change meanwhile."""
+        for run in self._runs:
+            yield from map(self._queue.__getitem__, self._part(run, reach))
 
-    def newest_first(self) -> Iterator[QueuedMeasurement]:
-        """Iterate over the queue, which must not change meanwhile."""
-        return reversed(self._queue.values())
+    def newest_first(self, reach: Reach = lambda _: UNLIMITED_REACH) -> Iterator[QueuedMeasurement]:
+        """Iterate over what is within reach; the queue must not change meanwhile."""
+        for run in reversed(self._runs):
+            yield from map(self._queue.__getitem__, reversed(self._part(run, reach)))
+
+    def _part(self, run: range, reach: Reach) -> range:
+        """Return the part of a run that is within reach."""
+        first_ns, last_ns = reach(self._queue[run.start].boot)
+        return run[bisect_left(run, first_ns, key=self._at_ns) : bisect_right(run, last_ns, key=self._at_ns)]
+
+    def _at_ns(self, sequence: int) -> int:
+        return self._queue[sequence].at_ns
 
     def remove(self, sequences: Iterable[int]) -> None:
         """Remove these numbers where they are queued."""
         for sequence in sequences:
-            self._queue.pop(sequence, None)
+            if self._queue.pop(sequence, None) is not None:
+                place = bisect_right(self._runs, sequence, key=_start) - 1
+                run = self._runs[place]
+                rest = range(run.start, sequence), range(sequence + 1, run.stop)
+                self._runs[place : place + 1] = filter(None, rest)
 
     def remove_through(self, sequence: int) -> None:
         """Remove all numbers up to this one, inclusive."""
-        self.remove(list(takewhile(lambda queued: queued <= sequence, self._queue)))
+        while self.oldest <= sequence and self._runs:
+            self.remove(range(self.oldest, min(self._runs[0].stop, sequence + 1)))
 
-    def retain(self, deliverable: Callable[[QueuedMeasurement], bool]) -> int:
-        """Remove what is not deliverable; return how many measurements that were."""
+    def retain(self, reach: Reach) -> int:
+        """Remove what is out of reach; return how many measurements that were."""
         before = len(self._queue)
-        self._queue = {sequence: queued for sequence, queued in self._queue.items() if deliverable(queued)}
+        runs = [part for run in self._runs if (part := self._part(run, reach))]
+        if runs != self._runs:
+            self._runs = runs
+            self._queue = {sequence: self._queue[sequence] for run in runs for sequence in run}
         return before - len(self._queue)
 
-    def pending_range(self, deliverable: Callable[[QueuedMeasurement], bool]) -> PendingRange:
+    def pending_range(self, reach: Reach) -> PendingRange:
         """Return which numbers a master waits for."""
-        numbers = [queued.sequence for queued in self._queue.values() if deliverable(queued)]
-        numbers.append(self._next)
+        runs = [part for run in self._runs if (part := self._part(run, reach))]
+        runs.append(range(self._next, self._next + 1))
         gaps = []
-        for before, after in pairwise(numbers):
-            first, last = before + 1, after - 1
-            if first < self.first_sequence <= after:  # a master knows of the numbers that the restart skipped
+        for before, after in pairwise(runs):
+            first, last = before.stop, after.start - 1
+            # A master knows of the numbers that the restart skipped.
+            if first < self.first_sequence <= after.start:
                 gaps += [
                     (first, min(last, self.first_sequence - RESTART_SKIP - 1)),
                     (self.first_sequence, last),
                 ]
             else:
                 gaps.append((first, last))
-        return PendingRange(numbers[0], tuple((first, last) for first, last in gaps if first <= last))
+        return PendingRange(runs[0].start, tuple((first, last) for first, last in gaps if first <= last))
 
 
 class DeliveryProgress:
@@ -146,12 +190,12 @@ class DeliveryProgress:
     ``oldest`` is that of the join request, which has to be sent while ``join_pending``.
     """
 
-    def __init__(self, send_queue: SendQueue, deliverable: Callable[[QueuedMeasurement], bool]) -> None:
+    def __init__(self, send_queue: SendQueue, reach: Reach) -> None:
         self._queue = send_queue
-        self._deliverable = deliverable
+        self._reach = reach
         self._acknowledged: int | None = None
         self._highest_sent = send_queue.first_sequence - 1  # earlier runs may have sent all of these
-        self.oldest, self._gaps = send_queue.pending_range(deliverable)
+        self.oldest, self._gaps = send_queue.pending_range(reach)
         self._known_oldest = self.oldest  # to the master
         self.join_pending = False
         self._reached = self.oldest - 1
@@ -166,7 +210,7 @@ class DeliveryProgress:
 
     def request_join(self) -> None:
         """Update :attr:`oldest` for a join request."""
-        self.oldest, gaps = self._queue.pending_range(self._deliverable)
+        self.oldest, gaps = self._queue.pending_range(self._reach)
         # Until the master has the request, it also waits for what was discarded.
         discarded = ((self._known_oldest, self.oldest - 1),) if self.oldest > self._known_oldest else ()
         self._gaps = _union(self._current_gaps(), (*discarded, *gaps))

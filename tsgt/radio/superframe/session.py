@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass
-from itertools import takewhile
+from itertools import islice, takewhile
+from math import inf
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.radio.superframe.command_exchange import CommandExchange
-from tsgt.radio.superframe.send_queue import DeliveryProgress, StampedMeasurement, quality_of
+from tsgt.radio.superframe.send_queue import (
+    NO_REACH,
+    DeliveryProgress,
+    StampedMeasurement,
+    quality_of,
+)
 from tsgt.radio.superframe.slots import GUARD_UNIT_NS, FrameTiming
 from tsgt.radio.superframe.wire import (
     ACK_FRAMES,
@@ -37,6 +44,11 @@ _BEACON_RELATIVE_EXTRA_US = 2000.0
 
 _MAX_REACH_NS = int(4.4 * 3600e9)
 """Measurements made longer before the first beacon have no timestamp within half a second, whatever the skew bound."""
+
+_MAX_EARLIER_REACH_NS = 1 << 45
+"""9.8 hours: no bound is half a second that far from the beacons of an earlier boot."""
+
+_MAX_DISCARDED = 50  # oldest measurements that one beacon discards; with more its reply might be late
 
 _USEFUL_BEACONS_NS = 60_000_000_000  # beacons later than this after an instant do not improve its timestamp
 
@@ -98,7 +110,7 @@ class StationSession:
     """One session of a master.
 
     ``confirmed``: a beacon has repeated the station's nonce: the session is not a replay. ``beacon``, ``slot``: the
-    newest beacon, and the slot for the reply to it.
+    newest beacon, and the slot for the reply to it. ``untimed``: what the last reply left out for want of a timestamp.
 
     Parameters
     ----------
@@ -132,8 +144,10 @@ class StationSession:
         self._boot = boot
         self._queue = send_queue
         self._clocks = dict(clocks)
+        self._earlier_reaches = {each: _reach(clock) for each, clock in clocks.items() if each != boot}
         self.clock = self._clocks.setdefault(boot, BeaconClock())
-        self.delivery = DeliveryProgress(send_queue, self.can_timestamp)
+        self.untimed: list[QueuedMeasurement] = []
+        self.delivery = DeliveryProgress(send_queue, self.reach)
         self.commands = CommandExchange()
         self.last_reply: SentReply | None = None
         self._unacknowledged: deque[SentReply] = deque(maxlen=ACK_FRAMES)
@@ -156,7 +170,7 @@ class StationSession:
             if beacon.session is not None:
                 self.timing = _frame_timing(self.timing.settings, beacon.session)
         joined = self._confirm(beacon)
-        discarded = self._queue.retain(self.can_timestamp) if joined else 0
+        discarded = self._queue.retain(self.reach) if joined else 0
         reception = self.reception()
         time_rejected = reception is not None and not self._add_sample(reception)
         if time_rejected:
@@ -253,32 +267,30 @@ class StationSession:
         if self.beacon.counter % len(beacon.stations) == mine:
             self.delivery.acknowledge_through(beacon.cumulative)
 
-    def can_timestamp(self, queued: QueuedMeasurement) -> bool:
-        """Whether a measurement has, or may soon have, a time on this master's clock.
+    def reach(self, boot: str) -> tuple[float, float]:
+        """Return between which times, on the clock of a boot, measurements have or may soon have a time on the master's.
 
-        Not if it is too far from all beacons for any quality. A measurement of an earlier boot needs the clock of that
-        boot to have converged: otherwise its beacons may have been delayed, and no later one can show it.
+        Those outside are too far from all beacons for any quality. Some inside may be too, between beacons many hours apart.
         """
-        clock = self._clocks.get(queued.boot)
-        if clock is None:
-            return False
-        if queued.boot == self._boot:
-            first_ns = clock.first_received_ns
-            return first_ns is None or first_ns - queued.at_ns <= _MAX_REACH_NS
-        time = clock.at(queued.at_ns) if clock.converged else None
-        return time is not None and quality_of(time.bound_us) is not None
+        if boot != self._boot:
+            return self._earlier_reaches.get(boot, NO_REACH)
+        first_ns = self.clock.first_received_ns
+        return -inf if first_ns is None else first_ns - _MAX_REACH_NS, inf
 
     def _discard_untimeable(self) -> int:
-        """Discard measurements, oldest first, that will never have a timestamp; return how many."""
+        """Discard measurements that will never have a timestamp, not all at once; return how many."""
         if not self.confirmed or not self.clock.converged:
             return 0
-        discarded = 0 if self._queue_checked else self._queue.retain(self.can_timestamp)
-        self._queue_checked = True
-        untimeable = [
-            queued.sequence for queued in takewhile(self._is_untimeable, self._queue.oldest_first())
-        ]
-        self._queue.remove(untimeable)
-        discarded += len(untimeable)
+        before = len(self._queue)
+        if not self._queue_checked:
+            self._queue.retain(self.reach)
+            self._queue_checked = True
+        oldest = islice(self._queue.oldest_first(), _MAX_DISCARDED)
+        # No beacon improves the clock of an earlier boot.
+        earlier = [queued for queued in self.untimed if queued.boot != self._boot]
+        untimeable = [*takewhile(self._is_untimeable, oldest), *earlier]
+        self._queue.remove(queued.sequence for queued in untimeable)
+        discarded = before - len(self._queue)
         if discarded:
             self.delivery.request_join()
         return discarded
@@ -328,6 +340,26 @@ class StationSession:
             return None
         turnaround_us = round(self.clock.elapsed(last.beacon.received_ns, last.done_ns).time_us)
         return turnaround_us if turnaround_us < 1 << TURNAROUND_BITS else None
+
+
+def _reach(clock: BeaconClock) -> tuple[float, float]:
+    """Return between which times the clock of an earlier boot is known.
+
+    It must have converged: otherwise its beacons may have been delayed, and no later one can show it. The bound of its
+    time increases with the distance from the first and the last beacon.
+    """
+    first_ns, last_ns = clock.first_received_ns, clock.last_received_ns
+    if not clock.converged or first_ns is None or last_ns is None:
+        return NO_REACH
+
+    def unknown(at_ns: int) -> bool:
+        time = clock.at(at_ns)
+        return time is None or quality_of(time.bound_us) is None
+
+    distances_ns = range(_MAX_EARLIER_REACH_NS)
+    before_ns = bisect_left(distances_ns, True, key=lambda distance_ns: unknown(first_ns - distance_ns))
+    after_ns = bisect_left(distances_ns, True, key=lambda distance_ns: unknown(last_ns + distance_ns))
+    return first_ns - before_ns + 1, last_ns + after_ns - 1
 
 
 def _frame_timing(settings: LoRaSettings, info: SessionInfo) -> FrameTiming:

@@ -221,7 +221,10 @@ class SuperframeStation:
     # --- Replies ----------------------------------------------------------------------------------------------
 
     def compose(self, instrument_state: InstrumentState, now_ns: int) -> bytes | None:
-        """Return the reply for the slot, composed as late as possible; None: no slot, too late, or slot too short."""
+        """Return the reply for the slot, composed as late as possible; None: no slot, too late, or slot too short.
+
+        Composing takes a while: ask :meth:`misses_slot` again before the reply is transmitted.
+        """
         session = self.session
         if session is None or session.slot is None:
             return None
@@ -232,11 +235,9 @@ class SuperframeStation:
             return None  # the master could not authenticate it; it grants more to unknown stations
         content = encode_reply(reply)
         length = len(content) + CODE_BYTES
-        latest_start_ns = slot.beacon_end_ns + session.timing.latest_start_ns(slot.slot, length)
-        if now_ns + PREPARATION_NS > latest_start_ns:
-            self.missed_slots += 1
+        self._latest_start_ns = slot.beacon_end_ns + session.timing.latest_start_ns(slot.slot, length)
+        if self.misses_slot(now_ns):
             return None
-        self._latest_start_ns = latest_start_ns
         session.reply_sent(reply, sequences)
         return content + self._authenticator.reply_code(
             session=session.master_nonce,
@@ -247,6 +248,12 @@ class SuperframeStation:
             sequence=sequences[0] if sequences else 0,
             content=content,
         )
+
+    def misses_slot(self, now_ns: int) -> bool:
+        """Whether the composed reply would be late if its transmission started now; counts that as a missed slot."""
+        late = now_ns + PREPARATION_NS > self._latest_start_ns
+        self.missed_slots += late
+        return late
 
     def sent(self, transmission: Transmission) -> None:
         """Take the transmission of the last composed reply."""

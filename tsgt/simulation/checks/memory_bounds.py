@@ -24,6 +24,7 @@ STATED_BOUNDS = {
     ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
     ("SuperframeLink", "_unsynced"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,  # whose lines wait there
     ("SendQueue", "_queue"): QUEUE_CAPACITY,
+    ("SendQueue", "_runs"): QUEUE_CAPACITY // 2,  # every other one is acknowledged
     ("Backlog", "queued"): QUEUE_CAPACITY,
     ("Backlog", "receptions"): MAX_RECEPTIONS,
     ("ImuSetupMonitor", "_records"): MAX_IMU_LINES,

@@ -93,6 +93,7 @@ class SuperframeLink:
         if not self._authenticator.authentic:
             log.warning("unauthenticated", key_file=None)
         self._slot_ns: int | None = None  # first beacon without a slot since the last one with it
+        self._discarded = 0  # and not logged yet
         self._log_limiter = LogLimiter()
         self._traffic_monitor = UnknownTrafficMonitor(clock)
 
@@ -100,8 +101,7 @@ class SuperframeLink:
         """Queue a measurement for delivery."""
         dropped_through = self._send_queue.dropped_through
         self._send_queue.add(queued_measurement(measurement, self._timeline.unix_at_zero_ns, self._boot))
-        if self._send_queue.dropped_through != dropped_through and self._may_log("measurements_discarded"):
-            log.warning("measurements_discarded", measurements=1)
+        self._log_discarded(int(self._send_queue.dropped_through != dropped_through))
 
     def respond(self, command: TrackCommand | SearchCommand | DirectCommand, *, ok: bool) -> None:  # noqa: ARG002 (only one is pending)
         """Queue the response to the pending command."""
@@ -154,7 +154,8 @@ class SuperframeLink:
         await self._clock.sleep_until(slot_ns - REPLY_LEAD_NS)
         self._watch.check()
         reply = self._station.compose(self._instrument_state(), self._clock.monotonic_ns())
-        if reply is not None:
+        # A late reply would collide with the next slot. To the station it is one that was lost on the air.
+        if reply is not None and not self._station.misses_slot(self._clock.monotonic_ns()):
             self._station.sent(await radio.transmit(reply, at_ns=slot_ns))
         if self._station.missed_slots != missed_slots:
             log.info("slot_missed", missed_slots=self._station.missed_slots)
@@ -178,10 +179,15 @@ class SuperframeLink:
             self._write_acknowledged()
         if beacon.joined:
             log.info("session_joined", queued=len(self._send_queue))
-        if beacon.discarded:
-            log.warning("measurements_discarded", measurements=beacon.discarded)
+        self._log_discarded(beacon.discarded)
         if beacon.time_rejected and self._may_log("beacon_time_rejected"):
             log.warning("beacon_time_rejected", rejected_beacons=self._station.rejected_beacons)
+
+    def _log_discarded(self, measurements: int) -> None:
+        self._discarded += measurements
+        if self._discarded and self._may_log("measurements_discarded"):
+            log.warning("measurements_discarded", measurements=self._discarded)
+            self._discarded = 0
 
     def _write_acknowledged(self) -> None:
         stamp_ns = self._timeline.unix_ns(self._acknowledged_ns)

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tsgt.radio.superframe import receive_window
 from tsgt.radio.superframe.receive_window import ReceiveWindow, SequenceSet
 from tsgt.radio.superframe.wire import RESTART_SKIP, JoinRequest
 
@@ -174,6 +175,70 @@ def test_reused_numbers_are_accepted() -> None:
     window = window_with(range(2 * RESTART_SKIP))
     window.join(join_request(first_sequence=3000, oldest=3000))
     assert window.accept(3000)
+
+
+def test_numbers_below_reused_ones_stay_received() -> None:
+    """The restarted station still has them, and sends them again."""
+    window = window_with(range(3 * RESTART_SKIP))
+    window.mark_written(range(90))
+    window.join(join_request(first_sequence=100 + RESTART_SKIP))
+    assert not any(window.accept(number) for number in range(100 + RESTART_SKIP))
+    assert window.cumulative == 89  # the others are not written yet
+    window.mark_written(range(90, 100))
+    assert window.cumulative == 99 + RESTART_SKIP
+    assert window.accept(100 + RESTART_SKIP)
+
+
+def test_returning_stream_may_reuse_numbers() -> None:
+    """As a restart without another stream in between."""
+    window = window_with(range(3 * RESTART_SKIP))
+    window.join(join_request(stream_id=8, first_sequence=700_000))
+    window.join(join_request(first_sequence=100 + RESTART_SKIP))
+    assert [window.accept(99), window.accept(100 + RESTART_SKIP)] == [False, True]
+
+
+@pytest.mark.parametrize("old_is", ["written", "lost"])
+def test_reused_number_is_recorded_when_its_new_measurement_is(old_is: str) -> None:
+    """The old one still waits for the disk when the new one arrives."""
+    first = 100 + RESTART_SKIP
+    window = window_with(range(first + 5))
+    window.join(join_request(first_sequence=first))
+    assert window.accept(first)
+    (window.mark_written if old_is == "written" else window.mark_lost)([first, first + 1])
+    assert not window.is_written([first])
+    assert [window.accept(first), window.accept(first + 1)] == [False, True]
+    window.mark_written([first])
+    assert window.is_written([first])
+    assert not window.is_written([first + 1])
+
+
+@given(st.data())
+def test_each_measurement_is_accepted_once(data: st.DataObject) -> None:
+    """Whatever a killed station had sent without journalling it, and whatever the master's disk does."""
+    window, skip = ReceiveWindow(), 5
+    run, first = 0, 0
+    journal: list[tuple[int, int]] = []  # measurements by run and number
+    waiting: list[tuple[int, int]] = []
+    received: set[tuple[int, int]] = set()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(receive_window, "RESTART_SKIP", skip)
+        for _ in range(data.draw(st.integers(1, 4), label="runs")):
+            made = [(run, first + n) for n in range(data.draw(st.integers(0, 20), label="measurements"))]
+            window.join(join_request(first_sequence=first))
+            for measurement in data.draw(st.permutations(journal + made), label="received"):
+                assert window.accept(measurement[1]) == (measurement not in received)
+                waiting += [measurement] if measurement not in received else []
+                received.add(measurement)
+            for _ in range(data.draw(st.integers(0, len(waiting)), label="through the disk")):
+                measurement = waiting.pop(0)
+                if data.draw(st.booleans(), label="written"):
+                    window.mark_written([measurement[1]])
+                else:
+                    window.mark_lost([measurement[1]])
+                    received -= {measurement} & set(journal + made)
+            assert not any(window.is_written([each[1]]) for each in (*journal, *made) if each in waiting)
+            journal += made[: data.draw(st.integers(0, len(made)), label="journalled")]
+            run, first = run + 1, max([first - 1, *(number for _, number in journal)]) + 1 + skip
 
 
 def test_repeated_join_request_has_no_effect() -> None:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.radio.scripted_master import queued
+from harness.radio.scripted_master import local_ns, queued
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tsgt.radio.superframe import SendQueue, send_queue
 from tsgt.radio.superframe.receive_window import ReceiveWindow
-from tsgt.radio.superframe.send_queue import DeliveryProgress, PendingRange
+from tsgt.radio.superframe.send_queue import UNLIMITED_REACH, DeliveryProgress, PendingRange
 from tsgt.radio.superframe.wire import RESTART_SKIP, JoinRequest
 
 if TYPE_CHECKING:
@@ -32,9 +33,9 @@ def of(numbers: Iterable[int], *, first_sequence: int = 0, backlog: Iterable[int
     return box
 
 
-def anything(_: QueuedMeasurement) -> bool:
-    """Deliver every measurement."""
-    return True
+def everything(_: str) -> tuple[float, float]:
+    """Return a reach without limits."""
+    return UNLIMITED_REACH
 
 
 def left(box: SendQueue) -> list[int]:
@@ -74,6 +75,13 @@ def test_full_queue_drops_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (left(box), box.dropped_through) == ([4, 3, 2], 1)
 
 
+def test_long_backlog_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like that of a full queue: the newest stay."""
+    monkeypatch.setattr(send_queue, "QUEUE_CAPACITY", 3)
+    box = of([], first_sequence=9, backlog=[0, 1, 4, 5, 6])
+    assert (left(box), box.oldest, box.dropped_through) == ([6, 5, 4], 4, 1)
+
+
 @pytest.mark.parametrize(
     ("numbers", "first_sequence", "backlog", "expected"),
     [
@@ -93,13 +101,53 @@ def test_pending_range(
     numbers: list[int], first_sequence: int, backlog: list[int], expected: PendingRange
 ) -> None:
     """Oldest number, and gaps above it."""
-    assert of(numbers, first_sequence=first_sequence, backlog=backlog).pending_range(anything) == expected
+    assert of(numbers, first_sequence=first_sequence, backlog=backlog).pending_range(everything) == expected
+
+
+@given(st.data())
+def test_search_by_runs_finds_what_a_search_of_all_finds(data: st.DataObject) -> None:
+    """For any queue, whatever has been removed from it, and whatever is within reach."""
+    boots = data.draw(st.lists(st.integers(0, 12), max_size=4), label="measurements per boot")
+    sequence, backlog = 0, []
+    for boot, count in enumerate(boots):
+        for _ in range(count):
+            sequence += data.draw(st.sampled_from([1, 1, 1, 4]), label="step")
+            backlog.append(queued(sequence, sequence, boot=str(boot)))
+    box = SendQueue(sequence + RESTART_SKIP + 1, backlog)
+    times = st.sampled_from([-inf, inf]) | st.integers(0, 80).map(local_ns)
+    reaches = {str(boot): data.draw(st.tuples(times, times), label="reach") for boot in range(len(boots))}
+
+    def is_within(each: QueuedMeasurement) -> bool:
+        first_ns, last_ns = reaches[each.boot]
+        return first_ns <= each.at_ns <= last_ns
+
+    for _ in range(data.draw(st.integers(0, 5), label="steps")):
+        if data.draw(st.booleans(), label="single numbers"):
+            gone = data.draw(st.sets(st.integers(0, 60)), label="removed")
+            box.remove(gone)
+        else:
+            through = data.draw(st.integers(0, 60), label="removed through")
+            box.remove_through(through)
+            gone = set(range(through + 1))
+        backlog = [each for each in backlog if each.sequence not in gone]
+        assert list(box.oldest_first()) == backlog
+        assert list(box.newest_first()) == backlog[::-1]
+        assert (len(box), box.oldest) == (len(backlog), min([e.sequence for e in backlog] or [box._next]))
+        expected = [each for each in backlog if is_within(each)]
+        assert list(box.oldest_first(reaches.__getitem__)) == expected
+        assert list(box.newest_first(reaches.__getitem__)) == expected[::-1]
+        pending = box.pending_range(reaches.__getitem__)
+        waited_for = set(range(pending.oldest, sequence + 1))
+        waited_for -= {number for first, last in pending.gaps for number in range(first, last + 1)}
+        assert waited_for == {each.sequence for each in expected}
+    assert box.retain(reaches.__getitem__) == len(backlog) - len(list(filter(is_within, backlog)))
+    assert list(box.oldest_first()) == list(filter(is_within, backlog))
 
 
 def test_cumulative_acknowledgement_is_read_conservatively() -> None:
     """Low bits mean the lowest possible number; unsent numbers are not acknowledged."""
     box = of(range(1000))
-    delivery = DeliveryProgress(box, anything)
+    delivery = DeliveryProgress(box, everything)
     delivery.mark_sent(range(600))
     delivery.acknowledge_through(300 % 256)
     assert box.oldest == 45  # it might be 300 too
@@ -119,7 +167,7 @@ def test_cumulative_acknowledgement_is_read_conservatively() -> None:
 def test_gap_blocks_cumulative_acknowledgement_until_join() -> None:
     """Nothing beyond a gap counts until the master knows of it."""
     box = of([*range(10), *range(300, 400)])
-    delivery = DeliveryProgress(box, anything)
+    delivery = DeliveryProgress(box, everything)
     delivery.mark_sent(range(400))
     delivery.acknowledge(range(10))
     outdated = [delivery.outdated]
@@ -141,7 +189,7 @@ def test_passed_restart_needs_join_request_at_once() -> None:
     first, second, third = (start + n * RESTART_SKIP for n, start in enumerate((2148, 2166, 2314), 1))
     backlog = [*range(2140, 2148), *range(first, first + 18), *range(second, second + 148)]
     box = of([third], first_sequence=third, backlog=backlog)
-    delivery = DeliveryProgress(box, anything)
+    delivery = DeliveryProgress(box, everything)
     delivery.mark_sent([third])
     delivery.acknowledge_through(2147 % 256)
     assert box.oldest == first
@@ -160,7 +208,7 @@ def test_passed_restart_needs_join_request_at_once() -> None:
 def test_small_gap_waits_for_others() -> None:
     """A join request takes the room of measurements."""
     box = of([*range(10), *range(20, 30), *range(40, 50)])
-    delivery = DeliveryProgress(box, anything)
+    delivery = DeliveryProgress(box, everything)
     delivery.mark_sent(range(50))
     delivery.acknowledge(range(10))
     assert not delivery.outdated
@@ -172,7 +220,7 @@ def test_dropped_measurements_are_a_gap(monkeypatch: pytest.MonkeyPatch) -> None
     """The master waits for them until the next join request."""
     monkeypatch.setattr(send_queue, "QUEUE_CAPACITY", 3)
     box = of(range(3))
-    delivery = DeliveryProgress(box, anything)
+    delivery = DeliveryProgress(box, everything)
     outdated = [delivery.outdated]
     box.add(queued(3, 3))
     outdated.append(delivery.outdated)
@@ -184,9 +232,9 @@ def test_dropped_measurements_are_a_gap(monkeypatch: pytest.MonkeyPatch) -> None
 def test_discarded_measurements_are_a_gap() -> None:
     """An acknowledgement below it is not read as a number 256 higher."""
     box = of(range(1000))
-    delivery = DeliveryProgress(box, anything)
+    delivery = DeliveryProgress(box, everything)
     delivery.mark_sent(range(900, 1000))
-    box.retain(lambda each: each.sequence >= 300)
+    box.retain(lambda _: (local_ns(300), inf))
     delivery.request_join()
     delivery.acknowledge_through(-1 % 256)
     assert box.oldest == 300
@@ -197,7 +245,7 @@ def test_discarded_measurements_are_a_gap() -> None:
 
 def test_narrow_number_is_unambiguous() -> None:
     """For every highest number that the master may have."""
-    delivery = DeliveryProgress(of(range(1000)), anything)
+    delivery = DeliveryProgress(of(range(1000)), everything)
     assert not delivery.may_be_narrow(0, 0)
     delivery.mark_sent(range(100))
     delivery.acknowledge([50])
@@ -272,7 +320,7 @@ class Exchange:
 
     def __init__(self, station: Station, master: Master) -> None:
         self._box, self._master = station.box, master
-        self._delivery = DeliveryProgress(station.box, anything)
+        self._delivery = DeliveryProgress(station.box, everything)
         self._join_pending = True
         self._joined = False
 

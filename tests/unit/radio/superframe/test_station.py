@@ -617,6 +617,30 @@ def test_measurements_long_before_first_beacon_are_discarded() -> None:
     assert set(master.received) == set(range(20, 40))
 
 
+def test_untimeable_measurements_between_beacons_do_not_block_others_after_reboot() -> None:
+    """Made in the middle of an outage of 40 hours; those near either end are delivered."""
+    send_queue, source = SendQueue(0), counted()
+    master, station = ScriptedMaster(), make_station(send_queue, random_bits=source)
+    receptions = collect(master, station, Instrument(SendQueue(0)), 60)
+    for number in range(1200):
+        master.now_ns += 120 * SECOND
+        send_queue.add(queued(number, master.now_ns))
+    master.grant = 0
+    for _ in range(8):
+        received = station.received(master.packet(master.beacon()))
+        assert received is not None
+        receptions += [] if received.reception is None else [received.reception]
+    master.grant = len(GRANT_BYTES) - 1
+    again = SendQueue(RESTART_SKIP + 1200, send_queue.oldest_first())
+    station = make_station(again, boot="later", receptions=receptions, random_bits=source)
+    for _ in range(120):
+        master.frame(station)
+    assert len(again) == 0
+    delivered = sorted(number for number in master.received if number < 1200)
+    assert {delivered[0], delivered[-1]} == {0, 1199}
+    assert 400 < len(delivered) < 800
+
+
 def test_old_measurements_of_short_queue_are_delivered() -> None:
     """One that needs a block of its own takes precedence once in a while."""
     master, station, send_queue = joined()

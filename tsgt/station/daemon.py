@@ -22,7 +22,7 @@ from tsgt.recording.journal import InstrumentRecord, JournalRecord
 from tsgt.recording.recorder import Recorder
 from tsgt.station.backlog import STREAM_ID_BITS, Backlog, read_backlog
 from tsgt.station.control_socket import AtmosphereRequest, AtmosphereResponse, ControlSocket
-from tsgt.station.instrument import Atmosphere, HostClockDependent
+from tsgt.station.instrument import Atmosphere
 from tsgt.station.instrument_supervisor import CommandResult, InstrumentSupervisor, RequestedAtmosphere
 from tsgt.station.journal import WRITE_TIMEOUT_S, JournalQueue
 from tsgt.station.links import ClassicLink, SuperframeLink
@@ -60,8 +60,7 @@ async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies:
         )
         suspended = await service.until_suspended(run)
         log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
-        if isinstance(dependencies.instrument, HostClockDependent):
-            dependencies.instrument.host_clock_restarted()
+        dependencies.instrument.host_clock_restarted()
 
 
 async def _run_until_suspended(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 from tsgt.model import check_finite, check_instants
 
@@ -86,7 +86,7 @@ class Instrument(Protocol):
 
     Every method raises :class:`~tsgt.errors.InstrumentError` when the instrument is lost or does not respond; the owner
     then calls :meth:`connect` again. :class:`~tsgt.errors.InstrumentRefusedError` means that the instrument responds but
-    does not carry out the command; it continues what it did before. One that keeps times is :class:`HostClockDependent`, too.
+    does not carry out the command; it continues what it did before.
     """
 
     async def connect(self) -> str:
@@ -125,10 +125,8 @@ class Instrument(Protocol):
     async def close(self) -> None:
         """Disconnect; :meth:`connect` may follow. The instrument stays on and keeps its lock."""
 
-
-@runtime_checkable
-class HostClockDependent(Protocol):
-    """An instrument that keeps times of the host's clock over :meth:`Instrument.close`: readings, a fit of its own clock."""
-
     def host_clock_restarted(self) -> None:
-        """Drop them while disconnected: the computer was suspended, so that they do not compare with later times."""
+        """Drop all times of the host's clock that outlive :meth:`close`: readings, a fit of the instrument's clock.
+
+        Called while disconnected: the computer was suspended, so that they do not compare with later times.
+        """

@@ -49,9 +49,13 @@ class CommandResult:
 
 @dataclass(slots=True)
 class RequestedAtmosphere:
-    """The atmosphere last requested, or None; applied after each connection, also by the next supervisor."""
+    """The atmosphere last requested and the last that was set, or None.
+
+    The requested one is applied after each connection, also by the next supervisor.
+    """
 
     atmosphere: Atmosphere | None = None
+    accepted: Atmosphere | None = None
 
 
 class InstrumentSupervisor:
@@ -93,6 +97,7 @@ class InstrumentSupervisor:
         self._command: Command | None = None
         self._requested = requested or RequestedAtmosphere()
         self._atmosphere_pending = False
+        self._atmosphere_problem = ""  # of a refusal that nobody was waiting for
         self._atmosphere_response: asyncio.Future[str] | None = None
         self._work_pending = asyncio.Event()
         self._reading: asyncio.Timeout | None = None
@@ -105,7 +110,11 @@ class InstrumentSupervisor:
     def condition(self) -> Condition:
         """The instrument's condition; while disconnected, the problem is the connection error."""
         condition = self._instrument.condition
-        return condition if self.description is not None else replace(condition, problem=self._error)
+        if self.description is None:
+            return replace(condition, problem=self._error)
+        return replace(
+            condition, problem="; ".join(filter(None, (condition.problem, self._atmosphere_problem)))
+        )
 
     def submit(self, command: Command) -> None:
         """Execute a command when the instrument is free; fails without one, and for a measurement while tracking."""
@@ -157,7 +166,7 @@ class InstrumentSupervisor:
             await self._close()
 
     async def _operate(self) -> NoReturn:
-        self._record, self._atmosphere_pending = None, False
+        self._record, self._atmosphere_pending, self._atmosphere_problem = None, False, ""
         description = await self._instrument.connect()
         if self._session.mode == "tracking":
             await self._instrument.track(self._session.prism)
@@ -247,10 +256,13 @@ class InstrumentSupervisor:
         except InstrumentRefusedError as error:
             problem = str(error)
             log.warning("atmosphere_refused", **values, error=problem)
-            if self._requested.atmosphere is atmosphere:
-                self._requested.atmosphere = None
+            if response is None:
+                self._atmosphere_problem = f"the atmosphere is not as required: {problem}"
+            elif self._requested.atmosphere is atmosphere:
+                self._requested.atmosphere = self._requested.accepted
         else:
-            problem = ""
+            problem = self._atmosphere_problem = ""
+            self._requested.accepted = atmosphere
             log.info("atmosphere_set", **values)
             self._publish_record()
         finally:

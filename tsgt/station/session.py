@@ -134,7 +134,7 @@ class ClientSession:
             settings=settings,
             mode=self.mode,
             prism=self.prism,
-            locked=None if last is None else last.status not in (Status.NO_TARGET, Status.ERROR),
+            locked=None if last is None else last.status.usable or last.status is Status.ANGLE_ONLY,
             last=None
             if last is None
             else LastMeasurement(

@@ -45,7 +45,8 @@ class LastMeasurement:
     horizontal_angle_rad, zenith_angle_rad
         0 where the instrument reported none.
     slope_distance_m
-        Without prism constant; null where the instrument reported none.
+        As the instrument gave it: with the prism constant that it adds itself, see ``settings``; null where it reported
+        none.
     """
 
     __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
@@ -83,7 +84,7 @@ class ClientStatus:
     prism
         The tracked prism, or the one tracked before direct mode.
     locked
-        Whether the last measurement had a target; null before the first.
+        Whether the last measurement had a target, so that its angles are valid; null before the first.
     last
         Null before the first measurement.
     measurements

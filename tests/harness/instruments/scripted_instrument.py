@@ -108,6 +108,9 @@ class ScriptedInstrument:
     async def close(self) -> None:
         """Do nothing."""
 
+    def host_clock_restarted(self) -> None:
+        """Do nothing: it keeps no times."""
+
     async def _change(self, prism: int | None) -> None:
         await self._sleep(1)
         if self.mode_error is not None:

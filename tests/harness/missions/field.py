@@ -117,6 +117,9 @@ class SceneInstrument:
     async def close(self) -> None:
         """Do nothing."""
 
+    def host_clock_restarted(self) -> None:
+        """Do nothing: its times are true ones."""
+
     async def set_atmosphere(self, atmosphere: Atmosphere) -> None:
         """Do nothing."""
 

@@ -207,6 +207,38 @@ async def test_atmosphere_is_set_after_each_connection() -> None:
             instrument.fail()
 
 
+async def test_atmosphere_refused_after_a_connection_is_a_problem() -> None:
+    """Nobody waits for the response then: it is set at the next connection, and shown until then."""
+    async with bench() as day:
+        assert await day.supervisor.set_atmosphere(WARM) == ""
+        day.instrument.atmosphere_error = InstrumentRefusedError("it is busy")
+        for _ in range(2):
+            day.instrument.fail()
+            await asyncio.sleep(3.0)
+            assert day.instrument.record == RECORD
+            assert day.supervisor.condition.problem == "the atmosphere is not as required: it is busy"
+        day.instrument.atmosphere_error = None
+        day.instrument.fail()
+        await asyncio.sleep(3.0)
+        assert day.instrument.record is not None
+        assert day.instrument.record.temperature_c == 25.0
+        assert day.supervisor.condition == day.instrument.condition
+
+
+async def test_refused_atmosphere_keeps_the_last_one() -> None:
+    """That one is set at the next connection."""
+    async with bench() as day:
+        assert await day.supervisor.set_atmosphere(WARM) == ""
+        day.instrument.atmosphere_error = InstrumentRefusedError("too cold")
+        assert await day.supervisor.set_atmosphere(COLD) == "too cold"
+        assert not day.supervisor.condition.problem
+        day.instrument.atmosphere_error = None
+        day.instrument.fail()
+        await asyncio.sleep(3.0)
+        assert day.instrument.record is not None
+        assert day.instrument.record.temperature_c == 25.0
+
+
 async def test_refused_atmosphere_is_not_retried() -> None:
     """The request gets the reason."""
     async with bench() as day:

@@ -127,6 +127,14 @@ def test_single_measurement_is_journalled() -> None:
     assert status(session, 1.0).measurements == 0
 
 
+@pytest.mark.parametrize("value", Status)
+def test_locked_is_as_the_master_reports_it(value: Status) -> None:
+    """The last measurement had a target: at least its angles are valid."""
+    session = ClientSession(3, 1)
+    measure(session, 0.0, status=value)
+    assert status(session, 1.0).locked is (value in (Status.OK, Status.LOW_ACCURACY, Status.ANGLE_ONLY))
+
+
 def test_initial_status() -> None:
     """Unknown fields are null."""
     assert status(ClientSession(3, 1), 0.0) == ClientStatus(

@@ -220,12 +220,16 @@ class BridgeSession:
             elif len(self._readings) >= READING_QUEUE_CAPACITY:
                 self._rejected.add("the queue of readings is full", line)
             else:
-                self._readings.append(reading_of(each.line, each.prism, each.at_ns, each.received_ns))
+                self._readings.append(reading_of(*each))
                 self._rejected.last = ""
 
 
 def reading_of(
-    line: MeasurementLine | SingleMeasurementLine, prism: int | None, at_ns: int, received_ns: int
+    line: MeasurementLine | SingleMeasurementLine,
+    prism: int | None,
+    at_ns: int,
+    received_ns: int,
+    sigma_ns: int = 0,
 ) -> Reading:
     """Return the reading of a line; parameters as in :class:`~tsgt.station.instrument.Reading`."""
     return Reading(
@@ -238,4 +242,5 @@ def reading_of(
         raw_status=line.raw_status,
         instrument_time_ns=line.instrument_time_ns,
         received_ns=received_ns,
+        sigma_ns=sigma_ns,
     )

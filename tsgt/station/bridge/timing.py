@@ -28,12 +28,16 @@ _MAX_PENDING = 64
 
 
 class TimestampedLine(NamedTuple):
-    """A new measurement with its time and arrival, both on the host's CLOCK_MONOTONIC."""
+    """A new measurement with its time and arrival, both on the host's CLOCK_MONOTONIC.
+
+    ``sigma_ns``: standard error of the time from the fit of the instrument's clock; 0 where there is none.
+    """
 
     line: MeasurementLine
     prism: int
     at_ns: int
     received_ns: int
+    sigma_ns: int = 0
 
 
 class LineTimestamper:
@@ -139,10 +143,16 @@ class LineTimestamper:
         # Half a ms is added to truncated whole ms: near the envelope that lies after the arrival.
         host_ns = mapped.host_ns + fraction_ns
         at_ns = received_ns if 0 < host_ns - received_ns < _MS_NS else host_ns
-        return self._checked(line, prism, at_ns, received_ns, MAX_DELAY_NS)
+        return self._checked(line, prism, at_ns, received_ns, MAX_DELAY_NS, mapped.sigma_ns)
 
     def _checked(
-        self, line: MeasurementLine, prism: int, time_ns: int, received_ns: int, max_age_ns: int
+        self,
+        line: MeasurementLine,
+        prism: int,
+        time_ns: int,
+        received_ns: int,
+        max_age_ns: int,
+        sigma_ns: int = 0,
     ) -> TimestampedLine | str:
         ahead_s = (time_ns - received_ns) / 1e9
         if time_ns > received_ns:
@@ -154,4 +164,4 @@ class LineTimestamper:
             return "its time is not after that of the measurement before it"
         self._last_at_ns = at_ns
         self._last_status = _NO_STATUS
-        return TimestampedLine(line, prism, at_ns, received_ns)
+        return TimestampedLine(line, prism, at_ns, received_ns, sigma_ns)

@@ -129,8 +129,10 @@ async def _has_robotic_licence(line: GeoComConnection) -> bool | None:
 
 
 async def read_power(line: GeoComConnection, identity: Identity) -> Identity:
-    """Return the identity with the current state of the power supply."""
+    """Return the identity with the current state of the power supply, unchanged where the instrument does not report it."""
     reply = await line.call(Rpc.CSV_CHECK_POWER)
+    if not succeeded(reply):
+        return identity
     values = numeric_values(reply, 2)
     return replace(
         identity,

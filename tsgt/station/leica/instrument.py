@@ -12,11 +12,12 @@ import structlog
 from tsgt.errors import InstrumentError, InstrumentRefusedError
 from tsgt.station.geocom import connect
 from tsgt.station.instrument import Condition
-from tsgt.station.leica.identity import Identity, identify, read_power
-from tsgt.station.leica.measurement import reading_of
+from tsgt.station.leica.identity import Identity, identify, read_power, succeeded
+from tsgt.station.leica.measurement import not_aimed, reading_of
 from tsgt.station.leica.reacquisition import ReacquisitionSequence
 from tsgt.station.leica.search import RoboticLicenceMissing, TargetSearch
 from tsgt.station.leica.setup import (
+    ATMOSPHERE,
     DECIMALS,
     apply_setting,
     atmospheric_correction,
@@ -45,6 +46,8 @@ log = structlog.get_logger()
 _POWER_INTERVAL_NS: Final = 60_000_000_000
 _PPM_TOLERANCE: Final = 0.05
 _TAPE_MODES, _PRECISE_TAPE_MODES, _PRISM_MODES = (1,), (14, 1), (2,)
+
+_REFLECTOR, _DISTANCE_MODE = "the reflector", "the distance mode"
 
 _NO_LICENCE: Final = (
     "the licence GeoCOM Robotic is missing: the operator has to point the telescope and to lock on"
@@ -106,8 +109,8 @@ class LeicaInstrument:
         self._power_read_ns = self._clock.monotonic_ns()
         if identity.power_problem:
             log.warning("instrument_battery_low", percent=identity.battery_percent)
-        for problem in await set_up(line, self._config, identity):
-            self._add_problem(problem)
+        for name, problem in (await set_up(line, self._config, identity)).items():
+            self._report_setting(name, problem)
         await self._timestamper.synchronise(line)
 
     async def close(self) -> None:
@@ -128,7 +131,7 @@ class LeicaInstrument:
     async def _stop_tracking(self) -> None:
         tracking, self._tracking = self._tracking, None
         if tracking is not None:
-            self._operator_pending = tracking.awaits_operator
+            self._operator_pending |= tracking.awaits_operator
             if tracking.target_search is None:
                 self._lose_licence()
             await tracking.stop_search(resume=False)
@@ -148,10 +151,8 @@ class LeicaInstrument:
         line = self._connected()
         tracking = self._tracking
         if tracking is None:
-            config = self._config
-            constant_m = None if config.prism_constant_mm is None else config.prism_constant_mm / 1e3
-            self._add_problem(await set_reflector(line, config.prism_type, constant_m))
-            self._add_problem(await set_tracking_mode(line, config.distance_mode))
+            await self._set_prism(line)
+            self._report_setting(_DISTANCE_MODE, await set_tracking_mode(line, self._config.distance_mode))
             tracking = Tracking(
                 line, self._clock, self._timestamper, self._sequence, self._target_search(line)
             )
@@ -160,20 +161,20 @@ class LeicaInstrument:
             await tracking.start(prism if self._prism is None else self._prism)
             await self._read_back(line)
             self._tracking, self._direct = tracking, False
-        changed = self._operator_pending or (self._prism is not None and prism != self._prism)
-        self._operator_pending = False
-        self._prism = prism
-        if changed:
+        if self._operator_pending or (self._prism is not None and prism != self._prism):
             await tracking.change_prism(prism, towards)
         else:
             await tracking.search_for(towards)
+        self._operator_pending = False
+        self._prism = prism
 
     async def read(self) -> Reading:
         """Return the next reading while tracking."""
         line = self._connected()
         if self._tracking is None:
             raise InstrumentRefusedError("no prism is tracked; call track first")
-        if self._clock.monotonic_ns() - self._power_read_ns > _POWER_INTERVAL_NS:
+        due = self._clock.monotonic_ns() - self._power_read_ns > _POWER_INTERVAL_NS
+        if due and not self._tracking.searching:
             await self._check_power(line)
         return await self._tracking.read()
 
@@ -188,9 +189,8 @@ class LeicaInstrument:
     async def direct(self) -> None:
         """Release the prism and prepare for single measurements of targets that the operator aims at."""
         line = self._connected()
-        await self._stop_tracking()
-        self._direct = True
-        await clear_distance(line)
+        if self._tracking is not None:
+            await self._tracking.stop_search()
         search = self._target_search(line)
         if search is not None:
             try:
@@ -199,6 +199,9 @@ class LeicaInstrument:
                     await search.disable_atr()
             except RoboticLicenceMissing:
                 self._lose_licence()
+        await self._stop_tracking()
+        self._direct = True
+        await clear_distance(line)
         await self._set_target(line)
         await self._read_back(line)
 
@@ -211,10 +214,16 @@ class LeicaInstrument:
     async def _set_target(self, line: GeoComConnection) -> None:
         if self._config.target == "foil":
             modes = _PRECISE_TAPE_MODES if self._identity.properties.precise_tape else _TAPE_MODES
-            self._add_problem(await set_reflector(line, "tape", None))
-            self._add_problem(await set_distance_mode(line, modes))
+            self._report_setting(_REFLECTOR, await set_reflector(line, "tape", None))
         else:
-            await set_distance_mode(line, _PRISM_MODES)
+            modes = _PRISM_MODES
+            await self._set_prism(line)
+        self._report_setting(_DISTANCE_MODE, await set_distance_mode(line, modes))
+
+    async def _set_prism(self, line: GeoComConnection) -> None:
+        config = self._config
+        constant_m = None if config.prism_constant_mm is None else config.prism_constant_mm / 1e3
+        self._report_setting(_REFLECTOR, await set_reflector(line, config.prism_type, constant_m))
 
     async def measure(self) -> Reading:
         """Measure the target in the line of sight once, in one face or two; takes some seconds."""
@@ -226,9 +235,13 @@ class LeicaInstrument:
         search = self._target_search(line) if self._config.target == "prism" else None
         if search is not None:
             try:
-                await search.fine_adjust()
+                aimed = await search.fine_adjust()
             except RoboticLicenceMissing:
                 self._lose_licence()
+                search = None  # the operator aims
+            else:
+                if not succeeded(aimed):
+                    return reading_of(not_aimed(aimed), None, aimed.first_byte_ns)
         if self._config.target_faces == 1:
             measured = await measure_target(line, self._clock)
         else:
@@ -248,12 +261,13 @@ class LeicaInstrument:
             await self._tracking.start_measuring()  # a stored distance that prevented the setting was cleared
         if problem:
             raise InstrumentRefusedError(problem)
+        self._problems.pop(ATMOSPHERE, None)
         await self._read_back(line)
 
     @property
     def condition(self) -> Condition:
         """Current state, for the operator."""
-        problems = list(self._problems.values())
+        problems = [problem for problem in self._problems.values() if problem]
         tracking = self._tracking
         activity = "ready for single measurements" if self._direct else ""
         may_search = self._identity.robotic is not False
@@ -279,15 +293,16 @@ class LeicaInstrument:
         """Identity and settings, for the journal."""
         return self._record
 
-    def _add_problem(self, problem: str) -> None:
-        if problem:
+    def _report_setting(self, name: str, problem: str) -> None:
+        """Record why a setting is not as required; empty: it is."""
+        if problem and problem != self._problems.get(name):
             log.warning("instrument_setting_failed", problem=problem)
-            self._problems[problem.partition(":")[0]] = problem
+        self._problems[name] = problem
 
     async def _check_power(self, line: GeoComConnection) -> None:
         self._power_read_ns = self._clock.monotonic_ns()
         before, self._identity = self._identity, await read_power(line, self._identity)
-        if self._identity.power_problem and not before.power_problem:
+        if self._identity.power_problem not in ("", before.power_problem):
             log.warning("instrument_battery_low", percent=self._identity.battery_percent)
 
     async def _read_back(self, line: GeoComConnection) -> None:

@@ -91,6 +91,11 @@ def decode_full_measurement(reply: Reply) -> FullMeasurement:
     return FullMeasurement(horizontal_rad, zenith_rad, distance_m, time_ms, status, code, reply.first_byte_ns)
 
 
+def not_aimed(reply: Reply) -> FullMeasurement:
+    """Return the result of a measurement for which the telescope has not found its target."""
+    return FullMeasurement(0.0, 0.0, None, None, Status.NO_TARGET, reply.code, reply.first_byte_ns)
+
+
 class ReadingFactory:
     """Converts measurements of the tracked prism to readings.
 

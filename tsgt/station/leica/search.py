@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from tsgt.errors import InstrumentRefusedError
 from tsgt.station.geocom import Outcome, ReturnCode, Rpc, name_of, outcome_of
 from tsgt.station.leica.identity import numeric_values, succeeded
 from tsgt.station.leica.reacquisition import (
@@ -52,17 +53,20 @@ class TargetSearch:
         self._power_search = power_search
         self.target_found = False
 
-    async def lock_state(self) -> Lock | None:
-        """Query the lock state; None where the instrument does not report it."""
-        for _ in range(_TRIES):
-            values = numeric_values(await self._line.call(Rpc.MOT_READ_LOCK_STATUS), 1)
-            if values is not None and values[0] in (0, 1, 2):
-                return Lock(int(values[0]))
-        return None
+    async def release_lock(self) -> Lock:
+        """Release the target and return the lock state then; the telescope stays where it is, or where the operator turns it.
 
-    async def release_lock(self) -> None:
-        """Release the target; the telescope stays where it is, or where the operator turns it."""
-        await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 0)
+        Raises InstrumentRefusedError if it is not known to be released: it would be measured as the next target.
+        """
+        for _ in range(_TRIES):
+            reply = await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 0)
+            lock = await lock_state(self._line)
+            if lock is Lock.OUT or (succeeded(reply) and lock is not Lock.IN):
+                return lock or Lock.OUT
+        raise InstrumentRefusedError(
+            f"the instrument does not release the prism that it follows: {name_of(reply.code)}; try again, or switch"
+            " its lock off"
+        )
 
     async def search(self, window: SearchWindow) -> bool:
         """Search a window and lock on, with target recognition on first; return whether it is locked on now."""
@@ -71,58 +75,65 @@ class TargetSearch:
         await self._call(Rpc.AUS_SET_USER_ATR_STATE, 1)
         if window.centre is not None and not (window.sweep and self._power_search):
             await self._call(Rpc.AUT_MAKE_POSITIONING, *window.centre, 0, 0, 0, timeout_s=_TURN_TIMEOUT_S)
-        if not await (self._sweep_and_adjust(window) if window.sweep else self._adjust(window)):
+        if not (
+            await self._sweep_and_adjust(window) if window.sweep else succeeded(await self._adjust(window))
+        ):
             return False
         self.target_found = True
         await self._call(Rpc.AUS_SET_USER_LOCK_STATE, 1)
         await self._call(Rpc.AUT_LOCK_IN, timeout_s=_FINE_ADJUST_TIMEOUT_S)
-        return await self.lock_state() is Lock.IN
+        return await lock_state(self._line) is Lock.IN
 
     async def _sweep_and_adjust(self, window: SearchWindow) -> bool:
         """Sweep and point at the target; sweep again nearby if the robot has moved on meanwhile."""
         for _ in range(_MAX_SWEEPS):
-            if not succeeded(await self._sweep(window)):
+            if not await self._sweep(window):
                 return False
             self.target_found = True
             # The operator may have locked on meanwhile; another sweep would release that lock.
-            if await self._adjust(_HERE) or await self.lock_state() is Lock.IN:
+            if succeeded(await self._adjust(_HERE)) or await lock_state(self._line) is Lock.IN:
                 return True
             window = _NEARBY
         self.target_found = False
         return False
 
-    async def _adjust(self, window: SearchWindow) -> bool:
+    async def _adjust(self, window: SearchWindow) -> Reply:
         area = window.width_rad, window.height_rad, 0
-        return succeeded(await self._call(Rpc.AUT_FINE_ADJUST, *area, timeout_s=_FINE_ADJUST_TIMEOUT_S))
+        return await self._call(Rpc.AUT_FINE_ADJUST, *area, timeout_s=_FINE_ADJUST_TIMEOUT_S)
 
     async def disable_atr(self) -> None:
         """Switch the target recognition off, for targets that it does not recognise."""
         await self._call(Rpc.AUS_SET_USER_ATR_STATE, 0)
 
-    async def fine_adjust(self) -> None:
-        """Point exactly at the prism in the field of view, if there is one, without locking on."""
+    async def fine_adjust(self) -> Reply:
+        """Point exactly at the prism in the field of view, without locking on; return the reply, which may be that there is none."""
         await self._call(Rpc.AUS_SET_USER_ATR_STATE, 1)
-        await self._adjust(_HERE)
+        return await self._adjust(_HERE)
 
-    async def _sweep(self, window: SearchWindow) -> Reply:
+    async def _sweep(self, window: SearchWindow) -> bool:
         if self._power_search:
             reply = await self._sweep_by_power_search(window)
+            if reply is None:
+                return False
             if outcome_of(reply.code, has_values=False) not in _UNAVAILABLE:
-                return reply
+                return succeeded(reply)
             # The licence is present, as other procedures need it, too.
             self._power_search = False
             log.warning("power_search_unavailable", code=name_of(reply.code))
             if window.centre is not None:
                 await self._call(Rpc.AUT_MAKE_POSITIONING, *window.centre, 0, 0, 0, timeout_s=_TURN_TIMEOUT_S)
         area = min(window.width_rad, math.pi), window.height_rad, 0
-        return await self._call(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_TIMEOUT_S)
+        return succeeded(await self._call(Rpc.AUT_SEARCH, *area, timeout_s=_WINDOW_TIMEOUT_S))
 
-    async def _sweep_by_power_search(self, window: SearchWindow) -> Reply:
+    async def _sweep_by_power_search(self, window: SearchWindow) -> Reply | None:
+        """Return the reply; None where it is not known where to search."""
         if window.is_full_circle:
             return await self._line.call(
                 Rpc.AUT_PS_SEARCH_NEXT, _CLOCKWISE, _WITH_SWING, timeout_s=_FULL_CIRCLE_TIMEOUT_S
             )
-        centre = window.centre or await pointing(self._line) or Pointing(0.0, math.pi / 2)
+        centre = window.centre or await pointing(self._line)
+        if centre is None:
+            return None
         area = window.width_rad, window.height_rad, 1
         reply = await self._line.call(Rpc.AUT_SET_SEARCH_AREA, *centre, *area)
         if outcome_of(reply.code, has_values=False) in _UNAVAILABLE:
@@ -134,6 +145,15 @@ class TargetSearch:
         if outcome_of(reply.code, has_values=False) is Outcome.LICENCE:
             raise RoboticLicenceMissing
         return reply
+
+
+async def lock_state(line: GeoComConnection) -> Lock | None:
+    """Query the lock state, which needs no licence; None where the instrument does not report it."""
+    for _ in range(_TRIES):
+        values = numeric_values(await line.call(Rpc.MOT_READ_LOCK_STATUS), 1)
+        if values is not None and values[0] in (0, 1, 2):
+            return Lock(int(values[0]))
+    return None
 
 
 async def pointing(line: GeoComConnection) -> Pointing | None:

@@ -60,6 +60,8 @@ TRACKING_MODES: Final = {
 }
 """EDM modes for tracking, in order of preference. Synchronous tracking is a measurement program of its own."""
 
+ATMOSPHERE: Final = "the atmosphere"
+
 _TRIES: Final = 3
 _SYNCHRO: Final = 10
 _CONSTANT_TOLERANCE_M: Final = 1e-6
@@ -133,7 +135,7 @@ def atmospheric_correction(atmosphere: Atmosphere) -> Setting:
     """Return the setting of the atmospheric correction; the wavelength is kept, the relative humidity is taken as 60 %."""
     temperature_c, pressure_hpa = atmosphere.temperature_c, atmosphere.pressure_hpa
     return Setting(
-        "the atmosphere",
+        ATMOSPHERE,
         Rpc.TMC_GET_ATM_CORR,
         4,
         lambda now: (
@@ -191,12 +193,12 @@ async def clear_distance(line: GeoComConnection) -> None:
     await line.call(Rpc.TMC_DO_MEASURE, 3, 1)
 
 
-async def set_up(line: GeoComConnection, config: LeicaInstrumentConfig, identity: Identity) -> list[str]:
-    """Stop the measurement and apply all settings but reflector and distance mode; return what could not be set, and why."""
+async def set_up(line: GeoComConnection, config: LeicaInstrumentConfig, identity: Identity) -> dict[str, str]:
+    """Stop the measurement and apply all settings but reflector and distance mode; return why each is not set, empty if it is."""
     await line.call(Rpc.COM_SET_DOUBLE_PRECISION, DECIMALS)
     await clear_distance(line)
     settings = required_settings(config, identity)
-    problems = [problem for setting in settings if (problem := await apply_setting(line, setting))]
+    problems = {setting.name: await apply_setting(line, setting) for setting in settings}
     if identity.robotic is not False and identity.power_search:
         min_m, max_m = config.search_distance_m
         await line.call(Rpc.AUT_PS_SET_RANGE, min_m, max(max_m, min_m + 10))

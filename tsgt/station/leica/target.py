@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 from tsgt.errors import InstrumentRefusedError
 from tsgt.model import Status
-from tsgt.station.geocom import Rpc, name_of
-from tsgt.station.leica.identity import succeeded
+from tsgt.station.geocom import Outcome, Rpc, name_of, outcome_of
+from tsgt.station.leica.identity import numeric_values, succeeded
 from tsgt.station.leica.measurement import decode_full_measurement
 from tsgt.station.leica.setup import clear_distance
 
@@ -27,6 +27,7 @@ _MEASUREMENT_TIMEOUT_NS: Final = 8_000_000_000
 _CHANGE_FACE_TIMEOUT_S: Final = 30.0
 _TRIES: Final = 3
 _CLEAR, _MEASURE = 3, 1
+_NO_DISTANCE_YET: Final = frozenset({Outcome.ANGLE_ONLY, Outcome.LOW_ACCURACY})
 
 _FACE_TOLERANCE_RAD: Final = math.radians(0.2)
 _FACE_TOLERANCE_M: Final = 0.05
@@ -43,7 +44,11 @@ async def measure_target(line: GeoComConnection, clock: Clock) -> FullMeasuremen
     until_ns = clock.monotonic_ns() + _MEASUREMENT_TIMEOUT_NS
     while True:
         measured = decode_full_measurement(await line.call(Rpc.TMC_GET_FULL_MEAS, _WAIT_MS, 1))
-        pending = measured.status is Status.ANGLE_ONLY or measured.status is Status.ERROR
+        # While it measures, some codes come with angles alone, or without any values.
+        pending = measured.distance_m is None and (
+            measured.status in (Status.ANGLE_ONLY, Status.ERROR)
+            or outcome_of(measured.code, has_values=True) in _NO_DISTANCE_YET
+        )
         if not pending or clock.monotonic_ns() >= until_ns:
             break
         await clock.sleep_until(clock.monotonic_ns() + 50_000_000)
@@ -61,8 +66,14 @@ async def measure_in_two_faces(line: GeoComConnection, clock: Clock, *, at_prism
     first = await measure_target(line, clock)
     if first.distance_m is None:
         return first
-    await _change_face(line, at_prism=at_prism)
-    second = await measure_target(line, clock)
+    face = int(first.zenith_angle_rad > math.pi)
+    try:
+        await _change_face(line, at_prism=at_prism)
+        second = await measure_target(line, clock)
+    except InstrumentRefusedError:  # nothing else: a cancelled or lost client must not wait for the telescope
+        if await _face(line) != face:
+            await _change_face(line, at_prism=False)
+        raise
     await _change_face(line, at_prism=False)
     check_same_target(first, second)
     return mean_of_two_faces(first, second)
@@ -118,9 +129,21 @@ async def _start_program(line: GeoComConnection, program: int) -> None:
     )
 
 
+async def _face(line: GeoComConnection) -> int | None:
+    """Return the face: 0 the first, 1 the second; None where the instrument does not report it."""
+    values = numeric_values(await line.call(Rpc.TMC_GET_FACE), 1)
+    return None if values is None else int(values[0])
+
+
 async def _change_face(line: GeoComConnection, *, at_prism: bool) -> None:
+    before = await _face(line) if at_prism else None
     reply = await line.call(Rpc.AUT_CHANGE_FACE, 0, int(at_prism), 0, timeout_s=_CHANGE_FACE_TIMEOUT_S)
     if not succeeded(reply):
+        if before is not None and await _face(line) == 1 - before:
+            raise InstrumentRefusedError(
+                f"the instrument does not find the prism in the other face: {name_of(reply.code)}; check the line of sight,"
+                " or measure in one face (target_faces = 1)"
+            )
         raise InstrumentRefusedError(
             f"the instrument does not change its face: {name_of(reply.code)}; measure in one face (target_faces = 1)"
         )

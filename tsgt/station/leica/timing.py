@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from tsgt.service import LogLimiter
-from tsgt.station.geocom import Rpc
+from tsgt.station.geocom import Rpc, name_of
 from tsgt.station.leica.identity import numeric_values
 from tsgt.station.leica.measurement import MAX_TIME_MS, Timestamp
 from tsgt.timesync import ExchangeClock, InstrumentClock
@@ -50,6 +50,9 @@ _RESERVE_NS: Final = 10_000_000
 _MAX_NETWORK_SIGMA_NS: Final = 10_000_000
 """Over a network, distances whose times are known less well are not used: 15 mm at 1.5 m/s."""
 
+_MAX_WAIT_NS: Final = 3_000_000_000
+"""Distances that wait longer for the first time of the instrument's clock are a problem."""
+
 _REPEAT_WINDOW_MS: Final = 60_000  # a distance older than the last one by less than this is a repetition
 
 
@@ -70,6 +73,8 @@ class DistanceTimestamper:
         self._requested_ns = self._received_ns = 0
         self._exchange_ns = _EXCHANGE_NS
         self._failed = False
+        self._failed_code = 0
+        self._waiting_since_ns: int | None = None  # arrival of the first distance before the clock fit
 
     def reset(self, *, over_network: bool) -> None:
         """Start over with another instrument."""
@@ -80,6 +85,7 @@ class DistanceTimestamper:
     def host_clock_restarted(self) -> None:
         """Start over with the host's clock; a distance that has been reported is still not new."""
         self._clock_fit = ExchangeClock() if self.over_network else InstrumentClock()
+        self._waiting_since_ns = None
         self.problem = ""
 
     async def synchronise(self, line: GeoComConnection) -> None:
@@ -126,6 +132,7 @@ class DistanceTimestamper:
         self._received_ns = reply.first_byte_ns
         values = numeric_values(reply, 4)
         if values is None or not 0 < abs(values[3]) <= MAX_TIME_MS:
+            self._failed_code = reply.code
             return False
         resets = self._clock_fit.resets
         fit, time_ms = self._clock_fit, int(values[3])
@@ -151,6 +158,10 @@ class DistanceTimestamper:
         resets = self._clock_fit.resets
         time = self._clock_fit.timestamp(measured.time_ms, measured.first_byte_ns)
         self._report_reset(resets)
+        if not self._clock_fit.initialised:
+            self._wait_for_clock(measured.first_byte_ns)
+        elif self._waiting_since_ns is not None:
+            self._waiting_since_ns, self.problem = None, ""
         if time is not None and self.over_network:
             return self._over_network_timestamp(time)
         if time is None:
@@ -159,6 +170,13 @@ class DistanceTimestamper:
                 log.warning("distance_time_rejected", instrument_ms=measured.time_ms)
             return None
         return Timestamp(max(time.host_ns - self.latency_ns, 0), time.sigma_ns)
+
+    def _wait_for_clock(self, now_ns: int) -> None:
+        if self._waiting_since_ns is None:
+            self._waiting_since_ns = now_ns
+        if now_ns - self._waiting_since_ns >= _MAX_WAIT_NS:
+            code = name_of(self._failed_code)
+            self.problem = f"its distances are not used: it does not report the time of its clock: {code}"
 
     def _over_network_timestamp(self, time: HostTime) -> Timestamp | None:
         """Return a time unless its uncertainty is too large."""

@@ -28,7 +28,7 @@ from tsgt.station.leica.reacquisition import (
     window_at_direction,
     window_at_pointing,
 )
-from tsgt.station.leica.search import RoboticLicenceMissing, TargetSearch, pointing
+from tsgt.station.leica.search import RoboticLicenceMissing, TargetSearch, lock_state, pointing
 from tsgt.station.leica.setup import clear_distance
 
 if TYPE_CHECKING:
@@ -105,6 +105,8 @@ class Tracking:
         Action required of the operator; empty for none.
     tilted
         Whether the instrument reports that it is not level.
+    awaits_operator
+        Whether the prism was changed, and the new one has not been found.
     target_search
         None without the licence for it: the operator points the telescope then, and nothing is moved.
     """
@@ -125,13 +127,14 @@ class Tracking:
         self.activity = ""
         self.operator_request = ""
         self.tilted = False
+        self.awaits_operator = False
         self._poll_scheduler = PollScheduler()
         self._lock = Lock.OUT
         self._lock_queries_left = _MAX_LOCK_QUERIES  # 0 once the lock state is known
         self._lock_queried_ns = 0
         self._valid_from_ns = 0
         self._lost_ns: int | None = None
-        self._manual_pointing: ManualPointingDetector | None = None
+        self._manual_pointing: ManualPointingDetector | None = None  # None: the old prism may still be locked
         self._search: asyncio.Task[bool] | None = None
         self._rounds = 0
         self._round_trip_ns = _LOCK_QUERY_NS
@@ -148,7 +151,7 @@ class Tracking:
         self._readings.prism = prism
         self.activity = f"starting with prism {prism}"
         if self.target_search is not None:
-            await self._query_lock(self.target_search)
+            await self._query_lock()
         await self.start_measuring()
 
     async def start_measuring(self) -> None:
@@ -163,14 +166,16 @@ class Tracking:
         return self._readings.prism
 
     @property
-    def awaits_operator(self) -> bool:
-        """Whether the prism was changed, and the new one has not been found."""
-        return self._manual_pointing is not None
+    def searching(self) -> bool:
+        """Whether a search is in progress; the instrument replies to nothing else meanwhile."""
+        return self._search is not None
 
     async def search_for(self, towards: Direction | None) -> None:
         """Search for the prism now, at its expected direction, unless the instrument is locked on it."""
-        if self._manual_pointing is not None:
-            if towards is not None:
+        if self.target_search is None:
+            return
+        if self.awaits_operator:
+            if towards is not None and not self._locking_on:
                 await self._search_once(towards)
             return
         if towards is None:
@@ -181,7 +186,7 @@ class Tracking:
             return
         correction = self._sequence.restart(towards, self._clock.monotonic_ns())
         # A search that only has to lock on is not interrupted: commands every few seconds might never let it finish.
-        if not correction and not (self.target_search is not None and self.target_search.target_found):
+        if not correction and not self._locking_on:
             await self.stop_search()
         if self._lock is Lock.IN:
             await self._release_lock()
@@ -192,9 +197,15 @@ class Tracking:
         await self._release_lock()
         self._sequence.reset()
         self._readings.prism = prism
-        self._manual_pointing = ManualPointingDetector(await pointing(self._line), self._clock.monotonic_ns())
+        self.awaits_operator, self._manual_pointing = True, None
+        await self._watch_pointing()
         if towards is None or not await self._search_once(towards):
-            await self._call_operator(f"point the telescope at prism {prism}")
+            release = "" if self._lock is Lock.OUT else "release the lock, then "
+            await self._call_operator(f"{release}point the telescope at prism {prism}")
+
+    @property
+    def _locking_on(self) -> bool:
+        return self._search is not None and self.target_search is not None and self.target_search.target_found
 
     async def _search_once(self, towards: Direction) -> bool:
         """Search for a new prism at its expected direction only: elsewhere there may be other prisms."""
@@ -220,13 +231,15 @@ class Tracking:
                 await self.start_measuring()
 
     async def _release_lock(self) -> None:
+        """Release the lock; without the licence it remains. Raises InstrumentRefusedError if it remains otherwise."""
         if self.target_search is not None:
             try:
-                await self.target_search.release_lock()
+                self._lock = await self.target_search.release_lock()
             except RoboticLicenceMissing:
                 self._disable_search()
+        if self.target_search is None:
+            await self._query_lock()
         await clear_distance(self._line)
-        self._lock = Lock.OUT
         await self.start_measuring()
         self._valid_from_ns = self._started_ns
 
@@ -249,7 +262,7 @@ class Tracking:
         idle = self._next_poll_ns - now_ns >= _LOCK_QUERY_NS
         lock_interval_ns = _LOCK_INTERVAL_NS if idle else 2 * _LOCK_INTERVAL_NS
         if self.target_search is not None and now_ns - self._lock_queried_ns >= lock_interval_ns:
-            await self._query_lock(self.target_search)
+            await self._query_lock()
         else:
             await self._timestamper.maintain(self._line, self._clock, self._next_poll_ns)
         now_ns = self._clock.monotonic_ns()
@@ -287,7 +300,7 @@ class Tracking:
         # After a gap the target may be lost, and another one cross the line of sight.
         gap = since_last_ns > max(_GAP_NS, 3 * interval_ns)
         if self.target_search is not None and (gap or self._lock is not Lock.IN) and not self.awaits_operator:
-            await self._query_lock(self.target_search)
+            await self._query_lock()
         self._timestamper.mark_reported(time_ms)
         self._poll_scheduler.add_distance(time_ms)
         self._last_distance_ns = measured.first_byte_ns
@@ -309,11 +322,11 @@ class Tracking:
         """Reacquire the target, and report why there is no distance, unless it was reported just now."""
         now_ns = self._clock.monotonic_ns()
         self._next_poll_ns = now_ns + _IDLE_NS
-        if self._manual_pointing is not None:
-            await self._await_manual_pointing(self._manual_pointing)
+        if self.awaits_operator:
+            await self._await_manual_pointing()
         elif self.target_search is not None:
             if now_ns - self._lock_queried_ns >= _NO_LOCK_INTERVAL_NS:
-                await self._query_lock(self.target_search)
+                await self._query_lock()
             if measured.status is not Status.TILT and not self._lock_queries_left:
                 await self._search_next(self.target_search)
         if self._search is None and now_ns - self._last_distance_ns > _RESTART_NS:
@@ -329,14 +342,15 @@ class Tracking:
 
     # --- Lock and reacquisition -------------------------------------------------------------------------------
 
-    async def _query_lock(self, target_search: TargetSearch) -> None:
-        lock = await target_search.lock_state()
+    async def _query_lock(self) -> None:
+        lock = await lock_state(self._line)
         if lock is not None:  # otherwise keep the last known state: a search would release a lock
             self._lock = lock
         self._lock_queries_left = max(self._lock_queries_left - 1, 0) if lock is None else 0
         self._lock_queried_ns = self._clock.monotonic_ns()
         if self._lock is Lock.IN:
-            self.operator_request = ""
+            if not self.awaits_operator:
+                self.operator_request = ""
         elif self._lost_ns is None:
             self._lost_ns = self._lock_queried_ns
             log.info("prism_lost", prism=self.prism)
@@ -364,25 +378,35 @@ class Tracking:
                 self._rounds = self._sequence.rounds
                 await self._call_operator(f"point the telescope at prism {self.prism}, it is not found")
 
-    async def _await_manual_pointing(self, detector: ManualPointingDetector) -> None:
+    async def _await_manual_pointing(self) -> None:
         """Check whether the operator has pointed the telescope at the new prism."""
         self.activity = f"waiting for the telescope to be pointed at prism {self.prism}"
-        target_search, now_ns = self.target_search, self._clock.monotonic_ns()
-        if target_search is not None and now_ns - self._lock_queried_ns > 1_000_000_000:
-            await self._query_lock(target_search)
-            if self._lock is Lock.IN:  # locked on by hand
-                self._accept_prism()
-                return
-        here = await pointing(self._line)
-        if here is None or not detector.update(here, now_ns):
+        now_ns = self._clock.monotonic_ns()
+        if now_ns - self._lock_queried_ns >= _NO_LOCK_INTERVAL_NS:
+            await self._query_lock()
+        if self._manual_pointing is None:
+            await self._watch_pointing()
             return
-        if target_search is not None:
-            self._start_search(target_search, window_at_pointing())
+        if self._lock is Lock.IN:  # locked on by hand
+            self._accept_prism()
+            return
+        here = await pointing(self._line)
+        if here is None or not self._manual_pointing.update(here, now_ns):
+            return
+        if self.target_search is not None:
+            self._start_search(self.target_search, window_at_pointing())
         else:
             self._accept_prism()
 
+    async def _watch_pointing(self) -> None:
+        """Watch where the operator points from now on, once the old prism is released: until then the robot turns the telescope."""
+        if self._lock is Lock.OUT:
+            self._manual_pointing = ManualPointingDetector(
+                await pointing(self._line), self._clock.monotonic_ns()
+            )
+
     def _accept_prism(self) -> None:
-        self._manual_pointing = None
+        self.awaits_operator = False
         self.operator_request = ""
         self._valid_from_ns = self._clock.monotonic_ns()
 
@@ -413,7 +437,7 @@ class Tracking:
             self._accept_prism()
         elif self.awaits_operator:
             # The search may have turned the telescope; only later movements are the operator's.
-            self._manual_pointing = ManualPointingDetector(await pointing(self._line), now_ns)
+            await self._watch_pointing()
             await self._call_operator(f"point the telescope at prism {self.prism}")
         await self.start_measuring()
         return None

@@ -438,6 +438,7 @@ async def test_instrument_time_is_mapped_to_host_clock() -> None:
     errors_ms = [(reading.at_ns - true_ns[reading.instrument_time_ns or 0]) / 1e6 for reading in readings]
     assert max(map(abs, errors_ms)) < 4.0
     assert max(map(abs, errors_ms[20:])) < 1.5
+    assert all(reading.sigma_ns > 0 for reading in readings)
 
 
 async def test_power_cycle_resets_clock_fit() -> None:

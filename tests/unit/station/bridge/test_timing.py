@@ -70,3 +70,24 @@ def test_late_fractional_time_ends_correction() -> None:
     """The first times happened to be whole ones."""
     start_ns = 10**12 - 10**11 + 60 * 400 * MS
     assert abs(mean_error_ms(lambda ns: ns // MS * MS if ns < start_ns else ns // 1_000 * 1_000)) < 0.1
+
+
+def test_sigma_of_the_mapping_is_stated() -> None:
+    """Of times by the instrument's clock: it covers the errors that lines with varying delays leave."""
+    errors_ms, sigmas_ms = [], []
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        timestamper = LineTimestamper(latency_ns=0)
+        timestamper.program_started(decode(HelloLine, json.dumps(HELLO | {"stamps": "instrument"}).encode()))
+        for number in range(20):
+            at_ns = 10**12 + 400 * MS * number
+            record = measured(10.0 + number, instrument_time_ns=at_ns)
+            line = decode(MeasurementLine, json.dumps(record).encode())
+            received_ns = at_ns + int(random.uniform(0, 100 * MS))
+            for stamped in timestamper.push(line, 1, received_ns, together=False):
+                assert isinstance(stamped, TimestampedLine)
+                assert stamped.line.instrument_time_ns is not None
+                errors_ms.append((stamped.at_ns - stamped.line.instrument_time_ns) / MS)
+                sigmas_ms.append(stamped.sigma_ns / MS)
+    assert min(sigmas_ms) > 0.0
+    assert np.sqrt(np.mean(np.square(errors_ms))) < 2 * np.sqrt(np.mean(np.square(sigmas_ms)))

@@ -19,7 +19,7 @@ from tsgt.simulation.instrument.geocom import ForcedResponse
 from tsgt.station import Atmosphere
 from tsgt.station.geocom import Reply, ReturnCode, Rpc
 from tsgt.station.instrument_supervisor import InstrumentSupervisor
-from tsgt.station.leica.reacquisition import SearchWindow
+from tsgt.station.leica.reacquisition import Pointing, SearchWindow
 from tsgt.station.leica.search import TargetSearch
 from tsgt.station.session import ClientSession
 
@@ -249,7 +249,7 @@ async def test_manual_lock_after_sweep_is_kept() -> None:
     line = LockedByHand()
     target_search = TargetSearch(cast("GeoComConnection", line), power_search=True)
     assert await target_search.search(
-        SearchWindow("searching", sweep=True, centre=None, width_rad=0.1, height_rad=0.1)
+        SearchWindow("searching", sweep=True, centre=Pointing(1.0, 1.5), width_rad=0.1, height_rad=0.1)
     )
     assert line.called.count(Rpc.AUT_PS_SEARCH_WINDOW) == 1
 

@@ -14,6 +14,8 @@ from tsgt.config import TcpAddress
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
 from tsgt.simulation.instrument import PeerKind, SimulatedNetwork
+from tsgt.simulation.instrument.geocom import ForcedResponse
+from tsgt.station.geocom import ReturnCode, Rpc
 from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
@@ -95,4 +97,25 @@ async def test_unbounded_times_are_not_used() -> None:
             "distance_time_uncertain",
             "distance_time_certain",
         ]
+        await instrument.close()
+
+
+@pytest.mark.parametrize("code", [ReturnCode.NOT_IMPL, ReturnCode.TMC_ANGLE_ERROR])
+async def test_distances_without_a_clock_are_an_error(code: ReturnCode) -> None:
+    """The instrument does not say what time it is, so that no distance has a time: not a client that says nothing."""
+    async with leica_bench() as bench:
+        instrument, _ = over_network(bench)
+        refused = ForcedResponse(code=code, rpc=Rpc.TMC_GET_ANGLE1, times=10_000)
+        bench.station.server.forced.append(refused)
+        await instrument.connect()
+        await instrument.track(1)
+        async with asyncio.timeout(10.0):
+            reading = await instrument.read()
+        assert (reading.status, reading.slope_distance_m) == (Status.ERROR, None)
+        assert f"does not report the time of its clock: {code:d}" in instrument.condition.problem
+        bench.station.server.forced.clear()
+        async with asyncio.timeout(20.0):
+            while not (await instrument.read()).status.usable:
+                pass
+        assert not instrument.condition.problem
         await instrument.close()

@@ -64,7 +64,7 @@ def measured_prisms(parameters: Parameters, measurements: Sequence[Measurement])
 def check_time_span(parameters: Parameters, measurements: Sequence[Measurement], path: Path) -> None:
     """Raise if the measurements span more than :data:`MAX_EPOCHS` epochs."""
     stamps = [m.stamp_ns for m in measurements]
-    span_ns = max(stamps) - min(stamps)
+    span_ns = max(stamps, default=0) - min(stamps, default=0)
     if span_ns > MAX_EPOCHS * parameters.pipeline.period_ns:
         raise RecordingError(
             f"its measurements span {span_ns / 86_400e9:.1f} days, too many for one trajectory: "

@@ -124,7 +124,7 @@ def export(
             raise click.UsageError("MCAP is binary and is not written to stdout; give --output FILE")
         require_extra("MCAP files", "mcap.writer", "rosbags.typesys", extra="mcap")
     if output != STDOUT:
-        refuse_overwrite([recording, reference_path], output)
+        refuse_overwrite([recording, reference_path, imu.samples, imu.setup, imu.odometry], output)
     point = _point(point, recording)
     if format_name == "mcap":
         loaded = load(recording, keep_going=keep_going, point=point, imu=imu)

@@ -181,6 +181,18 @@ def test_inputs_are_not_overwritten(tsgt: Tsgt, live: Path, tmp_path: Path) -> N
         assert tsgt("export", live, *arguments).code == 2
 
 
+@pytest.mark.parametrize("option", ["--imu", "--imu-setup", "--wheel-odometry"])
+@pytest.mark.parametrize("command", ["export", "process"])
+def test_inputs_of_the_imu_are_not_overwritten(
+    tsgt: Tsgt, live: Path, tmp_path: Path, command: str, option: str
+) -> None:
+    """Their samples, their mounting, and the odometry."""
+    given = tmp_path / "given.csv"
+    given.write_text("time_s,linear_mps,angular_radps\n")
+    outcome = tsgt(command, live, option, given, "--output", given)
+    assert (outcome.code, "would replace its own input" in outcome.err) == (2, True)
+
+
 def test_missing_library_fails_before_the_work(
     tsgt: Tsgt, live: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

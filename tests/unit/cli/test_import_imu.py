@@ -31,7 +31,9 @@ def write_table(path: Path) -> Path:
     return path
 
 
-def write_bag(path: Path, *topics: str, plugin: StoragePlugin = StoragePlugin.MCAP) -> Path:
+def write_bag(
+    path: Path, *topics: str, plugin: StoragePlugin = StoragePlugin.MCAP, force_z: float = 9.81
+) -> Path:
     """Write the same samples as messages."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     types = store.types
@@ -52,7 +54,7 @@ def write_bag(path: Path, *topics: str, plugin: StoragePlugin = StoragePlugin.MC
                     orientation_covariance=covariance,
                     angular_velocity=types["geometry_msgs/msg/Vector3"](x=n / 1000, y=0.0, z=0.1),
                     angular_velocity_covariance=covariance,
-                    linear_acceleration=types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=9.81),
+                    linear_acceleration=types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=force_z),
                     linear_acceleration_covariance=covariance,
                 )
                 data = store.serialize_cdr(message, "sensor_msgs/msg/Imu")
@@ -93,6 +95,17 @@ def test_bag_is_imported(tmp_path: Path, plugin: StoragePlugin) -> None:
     """By the stamps in the messages, not by those of the bag."""
     output = imported(tmp_path, write_bag(tmp_path / "bag", "/imu/data", plugin=plugin))
     assert next(read_imu_samples(output)).stamp_ns[0] == START_NS
+
+
+@pytest.mark.parametrize("force_z", [float("nan"), float("inf"), 1e30])
+def test_absurd_sample_of_a_bag_is_one_line(tmp_path: Path, force_z: float) -> None:
+    """With its time and the limits, which are those of a table; nothing is written."""
+    bag = write_bag(tmp_path / "bag", "/imu", force_z=force_z)
+    outcome = called("import", "imu", bag, "--output", tmp_path / "imu.jsonl")
+    assert outcome.code == 1
+    assert f"specific_force_z_mps2 of the sample at {START_NS} ns is" in outcome.err
+    assert "expected -2000 to 2000" in outcome.err
+    assert not (tmp_path / "imu.jsonl").exists()
 
 
 def test_topic_is_chosen(tmp_path: Path) -> None:

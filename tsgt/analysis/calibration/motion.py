@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from tsgt.analysis.evaluation import (
     HeldOutErrors,
@@ -39,6 +42,19 @@ class HeldOutComparison:
     linear: HeldOutErrors
     before: HeldOutErrors | None
     after: HeldOutErrors
+
+    @property
+    def grown(self) -> bool | None:
+        """Whether the calibration made the mean error larger; None: there is nothing to compare.
+
+        Of the measurements that are not at gaps; if most are at gaps, as at a low rate, of all.
+        """
+        at_gap = self.after.at_gap
+        if self.before is None or not len(at_gap):
+            return None
+        judged = ~at_gap if at_gap.mean() < 0.5 else np.ones_like(at_gap)
+        growth_m = float((self.after.error_m - self.before.error_m)[judged].mean())
+        return None if math.isnan(growth_m) else growth_m > 0.0
 
 
 @dataclass(frozen=True, slots=True)

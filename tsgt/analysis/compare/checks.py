@@ -28,7 +28,7 @@ _MIN_OVERLAP_S = 10.0
 _SMALL_SHARE = 0.5  # Of the longer of both; less overlap is a warning
 _ZONE_S, _MAX_ZONE_S = 1800.0, 14.5 * 3600.0  # Time zones differ by multiples of half an hour
 _CONSTANT_M, _MOVING_M = 1e-3, 0.1
-_STEP_S, _MIN_STEP_M = 1.0, 0.02
+_STEP_S, _MIN_STEP_M, _INTERPOLATED_STEPS = 1.0, 0.02, 10
 _MILLI, _SCALE = (500.0, 2000.0), 2.0
 _SAMPLES = 500
 _WRONG_ORDER_RAD, _ORDER_RATIO = np.radians(15.0), 3.0
@@ -46,14 +46,19 @@ class InputFinding:
 
 
 def input_findings(
-    reference: ReferencePoses, estimate: Estimate, *, offset_s: float = 0.0, scale_fitted: bool = False
+    reference: ReferencePoses,
+    estimate: Estimate,
+    *,
+    offset_s: float = 0.0,
+    max_offset_s: float = 0.0,
+    scale_fitted: bool = False,
 ) -> tuple[InputFinding, ...]:
     """Check times, motion and unit of an estimate; the first errors first.
 
-    ``offset_s``: time on the reference's clock less that of the estimate, as far as it is known. With ``scale_fitted`` the unit of
-    the positions is of no importance.
+    ``offset_s``: time on the reference's clock less that of the estimate, as far as it is known; it is searched within
+    ``max_offset_s``. With ``scale_fitted`` the unit of the positions is of no importance.
     """
-    found = [_time_finding(reference, estimate, offset_s), _motion_finding(reference, estimate)]
+    found = [_time_finding(reference, estimate, offset_s, max_offset_s), _motion_finding(reference, estimate)]
     if not scale_fitted and found[1] is None:
         found.append(_unit_finding(reference, estimate))
     return tuple(
@@ -107,7 +112,9 @@ def quaternion_finding(reference: ReferencePoses, estimate: Estimate, offset_s: 
     )
 
 
-def _time_finding(reference: ReferencePoses, estimate: Estimate, offset_s: float) -> InputFinding | None:
+def _time_finding(
+    reference: ReferencePoses, estimate: Estimate, offset_s: float, max_offset_s: float
+) -> InputFinding | None:
     (start, end), (own_start, own_end) = _span(reference), _ends(estimate.stamp_ns + round(1e9 * offset_s))
     overlap_s = (min(end, own_end) - max(start, own_start)) / 1e9
     length_s, own_length_s = (end - start) / 1e9, (own_end - own_start) / 1e9
@@ -118,6 +125,13 @@ def _time_finding(reference: ReferencePoses, estimate: Estimate, offset_s: float
                 "relative_times",
                 "the times are no Unix times: they count from the start of a program; the offset is searched wherever both "
                 "overlap, and a wrong one may fit",
+            )
+        if max_offset_s >= _MIN_OVERLAP_S - overlap_s:
+            return InputFinding(
+                "warning",
+                "no_overlap",
+                f"no overlap in time as stamped, they are {-overlap_s:.0f} s apart: the offset is searched within "
+                f"{max_offset_s:g} s",
             )
         return InputFinding(
             "error",
@@ -186,9 +200,11 @@ def _factor(ratio: float) -> str:
 def _typical_step_m(stamp_ns: NDArray[np.int64], position_m: FloatArray) -> float:
     """Return the distance covered in a second, exceeded in a quarter of all seconds; what runs away at the end has no say."""
     time_s = (stamp_ns - stamp_ns[0]) / 1e9
-    grid_s = np.arange(0.0, time_s[-1], _STEP_S)
-    grid_s = grid_s[: 10 * len(time_s)]  # times in another unit
+    # Seconds with poses and those behind them: a single time of a wrong clock may be 50 years away.
+    grid_s = np.unique(np.floor(time_s))[:, None] + _STEP_S * np.arange(_INTERPOLATED_STEPS)
+    grid_s = np.unique(grid_s[grid_s < time_s[-1]])
     steps = np.diff(np.column_stack([np.interp(grid_s, time_s, axis) for axis in position_m.T]), axis=0)
+    steps = steps[np.diff(grid_s) == _STEP_S]
     return float(np.percentile(np.linalg.norm(steps, axis=1), 75)) if len(steps) else 0.0
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.compare.assessment import Assessment, assess, paired
+from tsgt.analysis.compare.assessment import MIN_POSES, Assessment, assess, paired
 from tsgt.analysis.compare.checks import input_findings, quaternion_finding, relative_offset_s
 from tsgt.analysis.compare.errors import JudgedErrors, absolute
 from tsgt.analysis.compare.fit_uncertainty import WEAK_SIGMA
@@ -74,7 +74,7 @@ class Comparison:
     Attributes
     ----------
     settings, fit, errors : What was asked for: the headline.
-    steps : Growing sets of fitted quantities, from none to all.
+    steps : Growing sets of fitted quantities, from none (unless both overlap by a fitted offset only) to all.
     smallest_fair : Index of the smallest fair set in ``steps``.
     warnings : What is doubtful about the estimate's times and units.
     """
@@ -226,6 +226,8 @@ def compare_estimate(
     if wrong is not None and wrong.severity == "error":
         raise GeometryError(wrong.text)
     pairing = Pairing(reference, estimate, max_sigma_m=max_sigma_m)
+    if not nested[0][0].parts and np.count_nonzero(nested[0][1].used) < MIN_POSES:
+        nested = nested[1:]  # as stamped, both hardly overlap
     steps = tuple(_step(pairing, own, found) for own, found in nested)
     same = [each.fit for each in steps if _set(each.settings) == _set(settings)]
     chosen = same[0] if same else fit(reference, estimate, settings, start)
@@ -256,7 +258,11 @@ def _checked(
         settings, start = replace(settings, max_offset_s=half_s), replace(start, offset_s=centre_s)
         warnings.append("its times are no Unix times; the offset was searched wherever both overlap")
     findings = input_findings(
-        reference, estimate, offset_s=start.offset_s, scale_fitted="scale" in settings.parts
+        reference,
+        estimate,
+        offset_s=start.offset_s,
+        max_offset_s=settings.max_offset_s if "offset" in settings.parts else 0.0,
+        scale_fitted="scale" in settings.parts,
     )
     for each in findings:
         if each.severity == "error":

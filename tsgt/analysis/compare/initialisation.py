@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
 GRID_S = 0.05
+MAX_GRID = 10_000_000  # Six days
 BASELINE_NS = 180_000_000  # Differences over it: white noise of an estimate counts little, turns remain
 MAX_BASELINE_NS = 1_100_000_000  # Estimates at 1 Hz
 MIN_OVERLAP_S = 10.0  # Of both, for a correlation to mean anything
@@ -90,12 +91,17 @@ def offset_by_correlation(
     if last_ns - first_ns < MIN_OVERLAP_S * 1e9:
         return start_s
     step_ns = round(GRID_S * 1e9)
-    own_first_ns = int(motion.stamp_ns[0]) + start_ns
+    # What lies further from the reference than its length cannot be told from another drive.
+    near_ns = margin_ns + trajectory.end_ns - trajectory.start_ns
+    own_first_ns = max(int(motion.stamp_ns[0]) + start_ns, trajectory.start_ns - near_ns)
+    own_last_ns = min(int(motion.stamp_ns[-1]) + start_ns, trajectory.end_ns + near_ns)
+    if max(last_ns - first_ns, own_last_ns - own_first_ns) > MAX_GRID * step_ns:
+        raise ValueError(
+            f"the time offset cannot be searched over {(own_last_ns - own_first_ns) / 86_400e9:.0f} days: remove poses with times of "
+            "a wrong clock, or narrow the search with --max-offset-s"
+        )
     grid_ns = first_ns + np.arange((last_ns - first_ns) // step_ns + 1) * step_ns
-    own_ns = (
-        own_first_ns
-        + np.arange((int(motion.stamp_ns[-1]) + start_ns - own_first_ns) // step_ns + 1) * step_ns
-    )
+    own_ns = own_first_ns + np.arange((own_last_ns - own_first_ns) // step_ns + 1) * step_ns
     reference = trajectory.motion_at(grid_ns)
     at_rest = (
         np.quantile(each[reference.known], 0.99) < limit

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.compare.interpolation import ReferenceTrajectory
+from tsgt.errors import GeometryError
 from tsgt.geometry import covariance_over_lever_arm, rotate, rotation_from_quaternion, transform_from
 
 if TYPE_CHECKING:
@@ -57,11 +58,14 @@ class Pairing:
     """Pairs an estimate with the reference under any relation; what follows from the clock alone is computed once for each clock.
 
     ``max_sigma_m``: of the sensor's position by the reference, along its least certain direction; above, the instant is left out.
+    Raises GeometryError for a limit without a covariance of the reference.
     """
 
     def __init__(
         self, reference: ReferencePoses, estimate: Estimate, *, max_sigma_m: float | None = None
     ) -> None:
+        if max_sigma_m is not None and reference.covariance is None:
+            raise GeometryError("the reference has no covariance that could exceed the limit of its sigma")
         self.reference = reference
         self.estimate = estimate
         self._max_sigma_m = max_sigma_m

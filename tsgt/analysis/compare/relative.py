@@ -183,7 +183,7 @@ def _segments(pairs: PairedPoses, path_m: FloatArray, length_m: float) -> NDArra
     if not len(path_m):
         return np.empty((0, 2), np.intp)
     time_s = (pairs.stamp_ns - pairs.stamp_ns[0]) / 1e9
-    starts = np.unique(np.searchsorted(time_s, np.arange(0.0, time_s[-1] + 1e-9, START_SPACING_S) - 1e-6))
+    starts = np.flatnonzero(np.diff(np.floor((time_s + 1e-6) / START_SPACING_S), prepend=-1.0))
     ends = np.searchsorted(path_m, path_m[starts] + length_m, side="right")
     inside = ends < len(path_m)
     return np.stack([starts[inside], ends[inside]], axis=1).astype(np.intp)

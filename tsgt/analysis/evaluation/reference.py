@@ -77,7 +77,7 @@ def read_tum(path: Path) -> Reference:
     frame. Raises InputFileError if it cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows write a byte order mark
     except OSError as error:
         raise InputFileError(f"cannot be read: {error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
@@ -121,7 +121,10 @@ def _stated_point(line: str, path: Path, number: int) -> ReferencePoint:
 def _pose(words: list[str], path: Path, number: int) -> tuple[int, list[float]]:
     """Parse one line; the timestamp as a decimal, since a float would lose its nanoseconds."""
     try:
-        stamp_ns = round(Decimal(words[0]) * 1_000_000_000)
+        stamp_s = Decimal(words[0])
+        if abs(stamp_s.adjusted()) > 20:  # expanding a huge exponent would take forever
+            raise ValueError(words[0])
+        stamp_ns = round(stamp_s * 1_000_000_000)
         check_instants(stamp_ns)
         row = [float(word) for word in words[1:]]
     except (ValueError, ArithmeticError) as error:  # decimal raises the latter

@@ -21,6 +21,7 @@ TABLE_SUFFIX = ".csv"
 _TIME = ("stamp_ns", "time_s")
 _RATE = tuple(f"angular_rate_{axis}_radps" for axis in "xyz")
 _FORCE = tuple(f"specific_force_{axis}_mps2" for axis in "xyz")
+_LIMITS = (*((name, 100.0) for name in _RATE), *((name, 2000.0) for name in _FORCE))
 _MESSAGE = "sensor_msgs/msg/Imu"
 
 
@@ -70,8 +71,8 @@ def _table(path: Path) -> Iterator[FileSample]:
         stamp_ns = (
             row.non_negative_integer("stamp_ns") if "stamp_ns" in row.cells else row.seconds_ns("time_s")
         )
-        wx, wy, wz = (row.within(name, -100.0, 100.0) for name in _RATE)
-        fx, fy, fz = (row.within(name, -2000.0, 2000.0) for name in _FORCE)
+        wx, wy, wz = (row.within(name, -limit, limit) for name, limit in _LIMITS[:3])
+        fx, fy, fz = (row.within(name, -limit, limit) for name, limit in _LIMITS[3:])
         yield FileSample(stamp_ns, (wx, wy, wz), (fx, fy, fz))
 
 
@@ -89,16 +90,24 @@ def _bag(path: Path, topic: str | None) -> Iterable[FileSample]:
                 f"has no topic of an IMU{'' if topic is None else f' named {topic}'}", path=path
             )
         return [
-            _sample(reader.deserialize(data, connection.msgtype))
+            _sample(reader.deserialize(data, connection.msgtype), path)
             for connection, _, data in reader.messages(connections=chosen)
         ]
 
 
-def _sample(message: object) -> FileSample:
+def _sample(message: object, path: Path) -> FileSample:
     stamp = message.header.stamp  # type: ignore[attr-defined]
     rate, force = message.angular_velocity, message.linear_acceleration  # type: ignore[attr-defined]
-    return FileSample(
+    sample = FileSample(
         int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec),
         (float(rate.x), float(rate.y), float(rate.z)),
         (float(force.x), float(force.y), float(force.z)),
     )
+    values = (*sample.angular_rate_radps, *sample.specific_force_mps2)
+    for (name, limit), value in zip(_LIMITS, values, strict=True):
+        if not abs(value) <= limit:  # true for NaN
+            raise InputFileError(
+                f"{name} of the sample at {sample.stamp_ns} ns is {value:g}; expected -{limit:g} to {limit:g}",
+                path=path,
+            )
+    return sample

@@ -127,7 +127,7 @@ def _read_sensor_positions(path: Path) -> dict[int, Vector3]:
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Return line number and columns of all non-blank lines."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # editors of Windows write a byte order mark
     except UnicodeDecodeError as error:
         raise InputFileError("is not a text file", path=path) from error
     except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,11 @@ class TargetMeasurement:
     slope_distance_m: float
     constant_m: float | None = None
     line: int
+
+    @property
+    def face(self) -> int:
+        """Face of the instrument, 1 or 2."""
+        return 2 if self.zenith_angle_rad % math.tau > math.pi else 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,22 +5,24 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from tsgt.errors import RecordingError
 from tsgt.recording import ImuStatus, OdometryStatus
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from tsgt.geometry import FloatArray
 
-_S = TypeVar("_S", ImuStatus, OdometryStatus)
+_T = TypeVar("_T")
 
 _TYPES = (b'"status"', b'"clock"', b'"event"')
 
@@ -72,13 +74,52 @@ class Log:
     odometry: OdometryStatus | None = None
 
 
+_Integer = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Station:
+    id: _Integer
+    rssi_dbm: float | None = None
+    snr_db: float | None = None
+    loss: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Status:
+    stamp_ns: _Integer
+    stations: tuple[_Station, ...] = ()
+    protocol: str | None = None
+    authenticated: bool | None = None
+    imu: Any = None
+    odometry: Any = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Clock:
+    stamp_ns: _Integer
+    station: _Integer
+    offset_ns: _Integer
+    bound_ns: _Integer
+    restarted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Event:
+    stamp_ns: _Integer
+    message: str = ""
+
+
+_adapter: Callable[[object], TypeAdapter[Any]] = cache(TypeAdapter)
+
+
 def read_log(path: Path) -> Log:
-    """Read status, clock and event records, for illustration only; unreadable lines are skipped.
+    """Read status, clock and event records, for illustration only; lines that cannot be used are skipped.
 
     Raises RecordingError if the file cannot be read.
     """
-    statuses: list[dict[str, Any]] = []
-    clocks: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    statuses: list[_Status] = []
+    clocks: dict[int, list[_Clock]] = defaultdict(list)
     events: list[tuple[int, str]] = []
     try:
         with path.open("rb") as file:
@@ -86,53 +127,61 @@ def read_log(path: Path) -> Log:
                 # Poses are most of a file: parsing them would take longer than everything else.
                 if raw.startswith(_SKIPPED_PREFIXES) or not any(kind in raw for kind in _TYPES):
                     continue
-                record = _parsed(raw)
-                match record.get("type"):
-                    case "status":
-                        statuses.append(record)
-                    case "clock":
-                        clocks[record["station"]].append(record)
-                    case "event":
-                        events.append((record["stamp_ns"], str(record.get("message", ""))))
+                match _parsed(raw):
+                    case _Status() as status:
+                        statuses.append(status)
+                    case _Clock() as clock:
+                        clocks[clock.station].append(clock)
+                    case _Event(stamp_ns, message):
+                        events.append((stamp_ns, message))
     except OSError as error:
         raise RecordingError(f"cannot be read ({error.strerror})", path=path) from error
-    last = statuses[-1] if statuses else {}
+    last = statuses[-1] if statuses else _Status(0)
     return Log(
         radio=_radio(statuses),
         clocks={station: _clock(records) for station, records in sorted(clocks.items())},
         events=tuple(events),
-        protocol=last.get("protocol"),
-        authenticated=last.get("authenticated"),
-        imu=_device(ImuStatus, last.get("imu")),
-        odometry=_device(OdometryStatus, last.get("odometry")),
+        protocol=last.protocol,
+        authenticated=last.authenticated,
+        imu=_valid(ImuStatus, last.imu),
+        odometry=_valid(OdometryStatus, last.odometry),
     )
 
 
-def _parsed(raw: bytes) -> dict[str, Any]:
+def _parsed(raw: bytes) -> _Status | _Clock | _Event | None:
     try:
         record = json.loads(raw)
     except ValueError:
-        return {}
-    return record if isinstance(record, dict) and isinstance(record.get("stamp_ns"), int) else {}
+        return None
+    match record:
+        case {"type": "status"}:
+            return _valid(_Status, record)
+        case {"type": "clock"}:
+            return _valid(_Clock, record)
+        case {"type": "event"}:
+            return _valid(_Event, record)
+    return None
 
 
-def _device(cls: type[_S], status: object) -> _S | None:
+def _valid(cls: type[_T], value: object) -> _T | None:
+    """Return the record; None without one, or if a field is missing or wrong."""
     try:
-        return None if status is None else TypeAdapter(cls).validate_python(status)
+        return None if value is None else _adapter(cls).validate_python(value)
     except ValidationError:
         return None
 
 
-def _radio(statuses: list[dict[str, Any]]) -> dict[int, RadioSeries]:
-    rows: dict[int, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+def _radio(statuses: list[_Status]) -> dict[int, RadioSeries]:
+    rows: dict[int, list[tuple[int, _Station]]] = defaultdict(list)
     for status in statuses:
-        for station in status.get("stations", ()):
-            rows[station["id"]].append((status["stamp_ns"], station))
+        for station in status.stations:
+            rows[station.id].append((status.stamp_ns, station))
     return {
         number: RadioSeries(
             np.array([stamp_ns for stamp_ns, _ in found], dtype=np.int64),
+            # None becomes NaN.
             *(
-                np.array([np.nan if s.get(key) is None else s[key] for _, s in found], dtype=np.float64)
+                np.array([getattr(station, key) for _, station in found], dtype=np.float64)
                 for key in ("rssi_dbm", "snr_db", "loss")
             ),
         )
@@ -140,10 +189,10 @@ def _radio(statuses: list[dict[str, Any]]) -> dict[int, RadioSeries]:
     }
 
 
-def _clock(records: list[dict[str, Any]]) -> ClockSeries:
-    stamp_ns, offset_ns, bound_ns = (
-        np.array([r[key] for r in records], dtype=np.int64) for key in ("stamp_ns", "offset_ns", "bound_ns")
-    )
+def _clock(records: list[_Clock]) -> ClockSeries:
     return ClockSeries(
-        stamp_ns, offset_ns, bound_ns, np.array([r["restarted"] for r in records], dtype=np.bool_)
+        np.array([record.stamp_ns for record in records], dtype=np.int64),
+        np.array([record.offset_ns for record in records], dtype=np.int64),
+        np.array([record.bound_ns for record in records], dtype=np.int64),
+        np.array([record.restarted for record in records], dtype=np.bool_),
     )

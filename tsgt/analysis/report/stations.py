@@ -52,7 +52,7 @@ class StationStatistics:
     rate_hz : Usable measurements per second, from the first to the last; NaN with fewer than two.
     longest_gap_s : Longest time without a usable measurement, including start and end of the recording.
     gaps, in_gaps : Number of gaps longer than the outage limit, and their share of the recording.
-    delay_median_s, delay_p95_s : From the measurement to its arrival at the master; unknown if imported.
+    delay_median_s, delay_p95_s : From the measurement to its arrival at the master, of those that are neither imported nor merged.
     distance_min_m, distance_max_m : Slope distances.
     """
 
@@ -96,8 +96,8 @@ def _record(station: int, measurements: Sequence[Measurement]) -> StationRecord:
 
 def _delays_s(measurements: Sequence[Measurement]) -> FloatArray:
     delay_ns = np.array([m.received_ns - m.stamp_ns for m in measurements], dtype=np.int64)
-    # An import has no times of arrival, and sets them to those of the measurements.
-    return delay_ns / 1e9 if delay_ns.any() else np.full(len(delay_ns), np.nan)
+    # Import and merge have no times of arrival, and set them to those of the measurements.
+    return np.where(delay_ns == 0, np.nan, delay_ns / 1e9)
 
 
 def station_statistics(
@@ -109,7 +109,7 @@ def station_statistics(
     long = steps_s > outage_limit_ns / 1e9
     span_s = (int(times_ns[-1]) - int(times_ns[0])) / 1e9 if len(times_ns) > 1 else 0.0
     whole_s = (end_ns - start_ns) / 1e9
-    delays = record.delay_s if len(record.delay_s) else np.array([np.nan])
+    delays = record.delay_s[np.isfinite(record.delay_s)]
     known = record.bound_ns[np.isfinite(record.bound_ns)]
     return StationStatistics(
         measurements=len(record.stamp_ns),
@@ -119,8 +119,8 @@ def station_statistics(
         gaps=int(long.sum()),
         in_gaps=float(steps_s[long].sum() / whole_s) if whole_s > 0 else 0.0,
         statuses=record.statuses,
-        delay_median_s=float(np.median(delays)),
-        delay_p95_s=float(np.percentile(delays, 95)),
+        delay_median_s=float(np.median(delays)) if len(delays) else np.nan,
+        delay_p95_s=float(np.percentile(delays, 95)) if len(delays) else np.nan,
         bound_max_ms=float(known.max()) / 1e6 if len(known) else np.nan,
         distance_min_m=record.distance_m[0],
         distance_max_m=record.distance_m[1],

@@ -21,6 +21,7 @@ from tsgt.analysis.gnss import (
     receivers,
     time_span,
 )
+from tsgt.analysis.validation import check_time_span, plausible_measurements
 from tsgt.cli.analyse.options import figure_option
 from tsgt.cli.options import json_option, keep_going_option, path_type
 from tsgt.cli.output import numbers, print_json, print_table, require_extra
@@ -88,6 +89,7 @@ def gnss(
     prisms: tuple[DistanceSeries, ...] = ()
     if recording is not None:
         loaded = load(recording, keep_going=keep_going)
+        check_time_span(loaded.parameters, plausible_measurements(loaded), recording)
         tracks = build_tracks(loaded.parameters, loaded.measurements)
         pairs, prisms = common_interval(
             pairs, prism_distances(loaded.parameters, tracks, recording), recording

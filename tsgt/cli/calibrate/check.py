@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.analysis.calibration import check_station, mean_points
+from tsgt.analysis.calibration import check_repeats, check_station, same_face_points
 from tsgt.analysis.formats import read_partial_target_file
 from tsgt.cli.calibrate.operator import Terminal
 from tsgt.cli.calibrate.session import target_session
@@ -91,6 +91,10 @@ def check(
         targets_file,
     )
 
+    for station in dict(cells):
+        checked = {target: before[station][target] for owner, target in cells if owner == station}
+        check_repeats(targets_file, checked, constant, f"target {{}} of station {station}")
+
     async def run() -> dict[int, dict[int, list[TargetMeasurement]]]:
         operator = Terminal()
         async with target_session(config, config_path, SystemClock(), operator.say) as session:
@@ -102,8 +106,7 @@ def check(
     results = {}
     for station, sights in measured.items():
         what = f"target {{}} of station {station}"
-        then = mean_points(targets_file, before[station], constant, what)
-        now = mean_points(targets_file, sights, constant, what)
+        then, now = same_face_points(targets_file, before[station], sights, constant, what)
         results[station] = check_station(then, now, limit_m=limit_mm / 1e3)
     try:
         write_target_checks(
@@ -157,7 +160,7 @@ async def measure_again(
     cells
         Stations and targets.
     before
-        Measurements before, by station and target; each target keeps its constant.
+        Measurements before, by station and target; each target keeps its constant, and is measured in the same face.
     constant_m
         Constant of targets without their own, in m.
 
@@ -181,7 +184,14 @@ async def measure_again(
                 operator.say(f"unknown key {reply!r}")
                 continue
             sight = await session.try_measure(operator, station, constant_m if own_m is None else own_m)
-            if sight is not None:
+            if sight is None:
+                continue
+            if sight.face not in {each.face for each in before[station][target]}:
+                operator.say(
+                    f"target {target} of station {station} was measured in face {3 - sight.face} only: "
+                    "turn the instrument to this face, whose index error and collimation are the same, and aim again"
+                )
+            else:
                 measured.setdefault(station, {})[target] = [sight]
     return measured
 

@@ -24,7 +24,7 @@ from tsgt.analysis.formats.trajectories import read_estimates
 from tsgt.cli.desk.comparison_reference import read_reference
 from tsgt.cli.desk.comparison_report import write_comparison_report
 from tsgt.cli.desk.comparison_text import print_comparisons
-from tsgt.cli.desk.report import PAGE_NAME
+from tsgt.cli.desk.report import PAGE_NAME, refuse_report
 from tsgt.cli.options import FiniteRange, OutputFile, json_option, path_type, point_option
 from tsgt.cli.output import print_json, refuse_overwrite, require_extra
 from tsgt.cli.progress import progress
@@ -141,6 +141,7 @@ def compare(
     the time offset and the alignment at the start are fitted; the error with everything fitted stands beside it.
     """
     if report_folder is not None:
+        refuse_report([reference, *estimates, extrinsic_path], report_folder)
         require_extra("reports", "matplotlib", "jinja2", extra="report")
     for path in (csv_path, output):
         refuse_overwrite([reference, *estimates, extrinsic_path], path)
@@ -149,6 +150,8 @@ def compare(
         raise click.UsageError(f"--output needs one estimate, got {len(found)}")
     settings, start = _settings(parts, align, extrinsic_path, max_offset_s)
     poses = read_reference(reference, point)
+    if max_sigma_mm is not None and poses.covariance is None:
+        raise click.UsageError(f"--max-sigma-mm needs a reference with covariances; {reference} has none")
     compared = _compare(poses, _with_names(found), settings, start, max_sigma_mm)
     if csv_path is not None:
         write_lines(csv_path, error_csv(compared))

@@ -24,7 +24,7 @@ from tsgt.analysis.refinement import refinement_keys, refinement_text
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.cli.desk.live_poses import print_live
 from tsgt.cli.desk.reference import compare_estimators, print_comparisons
-from tsgt.cli.desk.report import assess, print_verdicts, report_evaluation
+from tsgt.cli.desk.report import assess, print_verdicts, refuse_report, report_evaluation
 from tsgt.cli.options import (
     json_option,
     keep_going_option,
@@ -151,6 +151,8 @@ def evaluate(
     if reference_point is not None and reference_path is None:
         raise click.UsageError("--reference-point needs --reference")
     if report_folder is not None:
+        inputs = [recording, reference_path, odometry, frames, prisms, imu.samples, imu.setup, imu.odometry]
+        refuse_report(inputs, report_folder)
         require_extra("reports", "matplotlib", "jinja2", extra="report")
     loaded = load(
         recording,

@@ -106,7 +106,7 @@ def process(
     format_name = format_name or FORMATS.get(output.suffix)
     if format_name is None:
         raise click.UsageError(f"{unknown_suffix(output, tuple(FORMATS))}; or give --format")
-    refuse_overwrite([recording, frames, prisms, imu.samples, imu.setup], output)
+    refuse_overwrite([recording, frames, prisms, imu.samples, imu.setup, imu.odometry], output)
     started_s = time.perf_counter()
     loaded = load(
         recording,

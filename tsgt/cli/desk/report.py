@@ -23,13 +23,14 @@ from tsgt.analysis.report.log import read_log
 from tsgt.analysis.report.motion import distance_error_series
 from tsgt.analysis.report.stations import station_records, station_statistics
 from tsgt.analysis.validation import plausible_measurements
-from tsgt.cli.output import json_text, print_json
+from tsgt.cli.output import json_text, print_json, refuse_overwrite
 from tsgt.cli.progress import TUNING, progress
+from tsgt.cli.recordings import write_lines
 from tsgt.errors import OutputFileError
 from tsgt.estimation import build_tracks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.analysis.diagnosis import Diagnosis
@@ -43,6 +44,13 @@ if TYPE_CHECKING:
 
 PAGE_NAME = "report.html"
 NUMBERS_NAME = "report.json"
+
+
+def refuse_report(inputs: Iterable[Path | None], folder: Path) -> None:
+    """Reject a folder in which the report would replace one of its inputs."""
+    given = list(inputs)
+    for name in (PAGE_NAME, NUMBERS_NAME):
+        refuse_overwrite(given, folder / name)
 
 
 def assess(
@@ -190,7 +198,7 @@ def write_page(
             if on_progress is not None:
                 on_progress(number / len(plots))
         text = render_page(title, head, path_map, made, images)
-        (folder / PAGE_NAME).write_text(text, encoding="utf-8")
-        (folder / NUMBERS_NAME).write_text(json_text(figures) + "\n", encoding="utf-8")
+        write_lines(folder / PAGE_NAME, [text])
+        write_lines(folder / NUMBERS_NAME, [json_text(figures), "\n"])
     except OSError as error:
         raise OutputFileError(error.strerror or str(error), path=folder) from error

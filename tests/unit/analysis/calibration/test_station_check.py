@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tsgt.analysis.calibration import StationCheck, check_station
+from tsgt.analysis.calibration import StationCheck, check_repeats, check_station, same_face_points
+from tsgt.analysis.formats import TargetMeasurement
 from tsgt.geometry import (
     cartesian_to_polar,
     exp_so3,
@@ -140,3 +142,38 @@ def test_only_current_targets_count() -> None:
     result = check_station(seen(TARGETS_M, UNMOVED, None), seen(TARGETS_M, moved(0.02), None).select((2, 5)))
     assert set(result.shifts_m) == {2, 5}
     assert result.moved_m == pytest.approx(0.02, abs=1e-6)
+
+
+def sights(
+    points_m: FloatArray, face: int, error_rad: float, rng: np.random.Generator
+) -> dict[int, list[TargetMeasurement]]:
+    """Measure targets in a face, with an index error and a collimation of ``error_rad``."""
+    result = {}
+    for target, point in enumerate(points_m, start=1):
+        noise = np.linalg.cholesky(measurement_covariance(*cartesian_to_polar(point), TARGET_NOISE))
+        h, z, d = map(float, cartesian_to_polar(point + noise @ rng.standard_normal(3)))
+        sign = 1.0 if face == 1 else -1.0
+        h -= sign * error_rad / np.sin(z)
+        result[target] = [
+            TargetMeasurement(
+                horizontal_angle_rad=(h + (0.0 if face == 1 else np.pi)) % (2 * np.pi),
+                zenith_angle_rad=(z if face == 1 else 2 * np.pi - z) + error_rad,
+                slope_distance_m=d,
+                line=1,
+            )
+        ]
+    return result
+
+
+@pytest.mark.parametrize("face", [1, 2])
+def test_targets_in_two_faces_are_compared_in_the_same_face(face: int) -> None:
+    """Index error and collimation of 0.3 mrad, 30 mm at 100 m, are no movement of the station, and no bad repeat."""
+    far_m = 100.0 * TARGETS_M / np.linalg.norm(TARGETS_M, axis=1)[:, None]
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        faces = [sights(far_m, each, 3e-4, rng) for each in (1, 2)]
+        before = {target: [*faces[0][target], *faces[1][target]] for target in faces[0]}
+        check_repeats(Path("f"), before, 0.0, "{}")
+        points = same_face_points(Path("f"), before, sights(far_m, face, 3e-4, rng), 0.0, "{}")
+        result = check_station(*points)
+        assert (result.ok, result.consistent) == (True, True)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -119,6 +120,25 @@ def test_invalid_trajectory_is_rejected(tmp_path: Path, text: str, problem: str)
     path.write_text(text)
     with pytest.raises(InputFileError, match=problem):
         read_tum(path)
+
+
+@pytest.mark.parametrize("stamp", ["1e900000", "-1e900000", "1e-900000"])
+def test_huge_exponent_is_not_expanded(tmp_path: Path, stamp: str) -> None:
+    """It would take half a minute; the small one is zero."""
+    path = tmp_path / "r.tum"
+    path.write_text(f"{stamp} 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n")
+    start_s = time.process_time()
+    with pytest.raises(InputFileError, match=r"is not a pose|not later than"):
+        read_tum(path)
+    assert time.process_time() - start_s < 1.0
+
+
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
+    """As editors of Windows write it, before a comment or a pose."""
+    path = tmp_path / "r.tum"
+    for comment in ("", "# reference_point: tip=1,2,3,0,0,0,1\n"):
+        path.write_text(f"{comment}1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n", encoding="utf-8-sig")
+        assert read_tum(path).reference_point.name == ("tip" if comment else "robot")
 
 
 def test_missing_file_is_named(tmp_path: Path) -> None:

@@ -33,6 +33,13 @@ def test_times_are_read_to_the_nanosecond(tmp_path: Path, text: str, stamp_ns: i
     assert read_track(path).stamps_ns.tolist() == [stamp_ns]
 
 
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
+    """As editors of Windows write it."""
+    path = tmp_path / "track.csv"
+    path.write_text("1.0 1 2 3\n", encoding="utf-8-sig")
+    assert read_track(path).stamps_ns.tolist() == [1_000_000_000]
+
+
 @pytest.mark.parametrize("text", ["nan", "inf", "-1", "1e40", "1_0:0"])
 def test_invalid_time_is_rejected(tmp_path: Path, text: str) -> None:
     """The message quotes the text of the file."""

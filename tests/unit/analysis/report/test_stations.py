@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from harness.drives.scene import SECOND, START, stationary_scene
 
-from tsgt.analysis.report.log import read_log
+from tsgt.analysis.report.log import Log, read_log
 from tsgt.analysis.report.stations import station_records, station_statistics
 from tsgt.model import Status
 
@@ -34,6 +35,19 @@ def test_station_statistics() -> None:
     assert np.isnan(found.bound_max_ms)
 
 
+def test_merged_measurements_have_no_delay() -> None:
+    """They arrived by no radio: a merge sets the time of arrival to that of the measurement."""
+    scene = stationary_scene()
+    made = [scene.measure(1, t) for t in (0.0, 0.5, 1.0, 1.5, 2.0)]
+    merged = [replace(each, received_ns=each.stamp_ns) for each in made[2:]]
+    (record,) = station_records([*made[:2], *merged], [1])
+    found = station_statistics(record, start_ns=START, end_ns=START + 5 * SECOND, outage_limit_ns=SECOND)
+    assert (found.delay_median_s, found.delay_p95_s) == pytest.approx((0.1, 0.1))
+    (record,) = station_records(merged, [1])
+    found = station_statistics(record, start_ns=START, end_ns=START + 5 * SECOND, outage_limit_ns=SECOND)
+    assert np.isnan(found.delay_median_s)
+
+
 def test_station_without_measurements_is_one_gap() -> None:
     """It has an entry nevertheless."""
     (record,) = station_records([], [3])
@@ -41,6 +55,31 @@ def test_station_without_measurements_is_one_gap() -> None:
     assert found.usable == 0
     assert (found.gaps, found.in_gaps, found.longest_gap_s) == (1, 1.0, 5.0)
     assert np.isnan(found.rate_hz)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"type": "clock", "stamp_ns": 5},
+        {"type": "clock", "stamp_ns": 5, "station": [], "offset_ns": 1, "bound_ns": 1, "restarted": False},
+        {"type": "clock", "stamp_ns": 5, "station": 2, "offset_ns": None, "bound_ns": 1, "restarted": False},
+        {"type": "clock", "stamp_ns": 5, "station": 2, "offset_ns": 2**63, "bound_ns": 1, "restarted": False},
+        {"type": "event", "message": "x"},
+        {"type": "event", "stamp_ns": 2**64, "message": "x"},
+        {"type": "status", "stamp_ns": 5, "stations": [{"rssi_dbm": -60.0}]},
+        {"type": "status", "stamp_ns": 5, "stations": [{"id": 2, "rssi_dbm": "loud"}]},
+        {"type": "status", "stamp_ns": 5, "stations": 3},
+        {"type": ["status"], "stamp_ns": 5},
+    ],
+)
+def test_log_record_with_missing_or_wrong_fields_is_skipped(
+    tmp_path: Path, record: dict[str, object]
+) -> None:
+    """The report is not lost for an illustration."""
+    path = tmp_path / "recording.jsonl"
+    event = {"type": "event", "stamp_ns": 6, "message": "station 2 is lost"}
+    path.write_text(f"{json.dumps(record)}\n{json.dumps(event)}\n", encoding="utf-8")
+    assert read_log(path) == Log({}, {}, ((6, "station 2 is lost"),), None, None)
 
 
 def test_radio_clocks_and_events_are_read(tmp_path: Path) -> None:

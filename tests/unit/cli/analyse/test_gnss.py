@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -135,6 +136,20 @@ def test_recording_of_another_day_is_rejected(tsgt: Tsgt, tmp_path: Path, record
     assert re.search(
         r"drive\.jsonl: its distances end 359\d\.\d s before the start of the receivers'", outcome.err
     )
+
+
+def test_recording_with_a_time_of_a_wrong_clock_is_rejected(
+    tsgt: Tsgt, files: list[Path], recording: Path
+) -> None:
+    """20 Hz over years would need all memory."""
+    records = [json.loads(line) for line in recording.read_text(encoding="utf-8").splitlines()]
+    with recording.open("a", encoding="utf-8") as file:
+        for last in {each["station"]: each for each in records[2:]}.values():
+            late_ns = last["stamp_ns"] + 1000 * 86_400 * 10**9
+            late = last | {"sequence": last["sequence"] + 1, "stamp_ns": late_ns, "received_ns": late_ns}
+            file.write(json.dumps(late) + "\n")
+    outcome = tsgt("analyse", "gnss", *files, "--recording", recording)
+    assert (outcome.code, "its measurements span 1000.0 days" in outcome.err) == (1, True)
 
 
 def test_every_json_key_is_documented(tsgt: Tsgt, files: list[Path], recording: Path) -> None:

@@ -16,7 +16,7 @@ from harness.hardware.radios import PAPER
 from harness.missions.field import TRUE, SceneInstrument, Station, field_of
 from harness.radio.client import client_config
 
-from tsgt.analysis.calibration import TargetCollection, check_station, mean_points
+from tsgt.analysis.calibration import TargetCollection, check_station, same_face_points
 from tsgt.analysis.formats import read_partial_target_file, read_target_file
 from tsgt.cli.calibrate.check import measure_again, print_check
 from tsgt.cli.calibrate.collect import collect_targets
@@ -52,16 +52,21 @@ class AimedInstrument(SceneInstrument):
         Which, from 1.
     T
         Where its tripod stands.
+    face
+        In which it measures.
     """
 
     target = 1
     T = np.eye(4)
+    face = 1
 
     async def measure(self) -> Reading:
         """Measure the target in five seconds."""
         reading = await super().measure()
         await asyncio.sleep(3.0)
         h, z, d = cartesian_to_polar(transform_points(invert(self.T), TARGETS[self.target - 1]))
+        if self.face == 2:
+            h, z = (h + np.pi) % (2 * np.pi), 2 * np.pi - z
         return replace(
             reading,
             prism=None,
@@ -385,10 +390,7 @@ async def test_moved_tripod_is_detected(
             cells = [(s, t) for s in STATIONS for t in (1, 2, 3)]
             now = await measure_again(cells, before, stations, script, constant_m=0.0)
     capsys.readouterr()
-    results = {
-        s: check_station(mean_points(path, before[s], 0.0, "{}"), mean_points(path, now[s], 0.0, "{}"))
-        for s in now
-    }
+    results = {s: check_station(*same_face_points(path, before[s], now[s], 0.0, "{}")) for s in now}
     assert print_check(results, as_json=True) == code
     printed = json.loads(capsys.readouterr().out)["stations"]
     assert [printed[s]["ok"] for s in ("1", "2", "3")] == [True, code == 0, True]
@@ -408,16 +410,49 @@ async def test_check_result_omits_skipped_targets(tmp_path: Path) -> None:
     assert {s: list(seen) for s, seen in now.items()} == {1: [2]}
 
 
-def test_check_of_unknown_target_or_station_is_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The target has not been measured before, or the station is not configured."""
-    config = tmp_path / "master.toml"
+async def test_check_asks_for_the_face_that_was_measured_before(tmp_path: Path) -> None:
+    """Index error and collimation have the opposite effect in the other face and would look like a movement."""
+    path = tmp_path / "targets.csv"
+    async with aimed(tmp_path) as (field, instruments):
+        await collected(field, Script(instruments), path)
+        before = read_partial_target_file(path).measurements
+        instruments[1].face = 2
+        script = Script(instruments, "", "q")
+        async with session(field, script) as stations:
+            now = await measure_again([(1, 1)], before, stations, script, constant_m=0.0)
+    assert now == {}
+    assert any("target 1 of station 1 was measured in face 1 only" in text for text in script.said)
+
+
+def _master_config(folder: Path) -> Path:
+    config = folder / "master.toml"
     config.write_text(
         'kind = "master"\n[setup]\nstation_frames = "a"\nprism_layout = "b"\n'
         "[[stations]]\nstation = 1\nprism = 1\nprism_constant_mm = 0.0\n"
         '[radio]\nkind = "simulated"\nair_socket = "air.sock"\nname = "master"\nfrequency_mhz = 905.0\n'
         'spreading_factor = 9\n[protocol]\nkind = "classic"\n[stream]\nsocket = "poses.sock"\n'
     )
-    targets = tmp_path / "targets.csv"
+    return config
+
+
+def test_inconsistent_repeats_are_reported_before_anybody_aims(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A round of sights would be lost; targets that are not checked do not matter."""
+    config, targets = _master_config(tmp_path), tmp_path / "targets.csv"
+    targets.write_text(
+        "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm\n"
+        "1,1,0.1,1.5,20.0,0\n1,2,0.9,1.5,20.0,0\n1,2,0.9,1.5,20.2,0\n"
+    )
+    common = ("calibrate", "check", "--config", config, "--targets", targets)
+    done = tsgt(*common)
+    assert (done.code, "target 2 of station 1: this measurement is" in done.err) == (1, True)
+    # Its simulated radio has no air server.
+    done = tsgt(*common, "--target", 1)
+    assert (done.code, "stop it first" in done.err) == (1, True)
+
+
+def test_check_of_unknown_target_or_station_is_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The target has not been measured before, or the station is not configured."""
+    config, targets = _master_config(tmp_path), tmp_path / "targets.csv"
     targets.write_text(
         "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm\n1,1,0.1,1.5,20.0,0\n"
     )

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
-from tsgt.analysis.calibration import calibrate_recording
+from tsgt.analysis.calibration import CalibratedRecording, HeldOutComparison, calibrate_recording
+from tsgt.analysis.evaluation import HeldOutErrors
 from tsgt.config import load_station_calibration
 from tsgt.geometry import exp_so3
 from tsgt.geometry.motion_calibration import SetupPrior
@@ -104,6 +106,61 @@ def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
     assert done.code == 0
     assert "station 2 x" in done.out
     assert "latency relative to station 1" in done.out
+
+
+@pytest.mark.parametrize(
+    ("after_mm", "code", "said"),
+    [([6.0], 3, "check failed: the held-out prediction error has grown"), ([], 0, "was not judged")],
+)
+def test_held_out_error_is_judged_or_the_command_says_so(
+    tsgt: Tsgt,
+    recording: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    after_mm: list[float],
+    code: int,
+    said: str,
+) -> None:
+    """All measurements at gaps, and none held out."""
+    before, after = (
+        HeldOutErrors(np.array(each) / 1e3, np.ones(len(each), np.bool_))
+        for each in ([5.0] * len(after_mm), after_mm)
+    )
+
+    def calibrate(*args: Any, **options: Any) -> CalibratedRecording:
+        found = calibrate_recording(*args, **options | {"held_out": False})
+        return replace(found, held_out=HeldOutComparison(before, before, after))
+
+    monkeypatch.setattr("tsgt.cli.calibrate.motion.calibrate_recording", calibrate)
+    done = tsgt("calibrate", "motion", recording)
+    assert (done.code, said in done.err) == (code, True)
+
+
+def test_range_scale_is_kept_and_applied_once(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """The frames were solved with it; the file replaces that of the recording, or of the master's configuration."""
+    lines = recording.read_text(encoding="utf-8").splitlines()
+    parameters = json.loads(lines[1])
+    for station, ppm in zip(parameters["stations"], (0.0, 20.0, -5.0), strict=True):
+        station["atmospheric_ppm"] = ppm
+    recording.write_text("\n".join([lines[0], json.dumps(parameters), *lines[2:], ""]), encoding="utf-8")
+    frames, poses = tmp_path / "frames.toml", tmp_path / "poses.jsonl"
+    assert tsgt("calibrate", "motion", recording, "--no-held-out", "--output", frames).code == 0
+    stations = load_station_calibration(frames).stations
+    assert [stations[k].range_scale_ppm for k in (1, 2, 3)] == [None, 20.0, -5.0]
+    options = ["--estimator", "linear", "--frames", frames, "--output", poses]
+    assert tsgt("process", recording, *options).code == 0
+    used = load_recording(poses).parameters.stations
+    assert [each.atmospheric_ppm for each in used] == [0.0, 20.0, -5.0]
+    assert [stations[each.station].applied(each).atmospheric_ppm for each in used] == [0.0, 20.0, -5.0]
+
+
+def test_recording_with_a_time_of_a_wrong_clock_is_rejected(tsgt: Tsgt, recording: Path) -> None:
+    """Two epochs per second over years would take forever."""
+    last = json.loads(recording.read_text(encoding="utf-8").splitlines()[-1])
+    last["stamp_ns"] = last["received_ns"] = last["stamp_ns"] + 1000 * 86_400 * 10**9
+    with recording.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(last | {"sequence": last["sequence"] + 1}) + "\n")
+    outcome = tsgt("calibrate", "motion", recording, "--initial-frames", "unknown")
+    assert (outcome.code, "its measurements span 1000.0 days" in outcome.err) == (1, True)
 
 
 def test_recording_of_points_is_rejected(tsgt: Tsgt, tmp_path: Path) -> None:

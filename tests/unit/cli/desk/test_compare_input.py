@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -90,6 +91,53 @@ def test_repairs_are_told(tsgt: Tsgt, tmp_path: Path) -> None:
         "only 20 s of overlap: the estimate lasts 20 s, the reference 60 s",
     ):
         assert said in outcome.err + outcome.out
+
+
+@pytest.mark.parametrize(
+    ("options", "both", "said"),
+    [
+        (("--fit", "none", "--align", "none"), False, ""),
+        ((), False, ""),
+        ((), True, "times of a wrong clock"),
+        (("--max-offset-s", "1e8"), False, "times of a wrong clock"),
+    ],
+)
+def test_absurd_time_costs_no_memory(
+    tsgt: Tsgt, tmp_path: Path, options: tuple[str, ...], said: str, *, both: bool
+) -> None:
+    """Poses of the year 1970 before those of 2026, in the estimate or in both files."""
+    reference, wrong = write(tmp_path / "reference.tum"), write(tmp_path / "wrong.tum")
+    lines = wrong.read_text().splitlines(keepends=True)
+    early = [f"{time_s} {lines[0].partition(' ')[2]}" for time_s in (0.0, 0.1, 0.2, 0.3)]
+    wrong.write_text("".join([*early, *lines]))
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (4 * 2**30, limits[1]))
+    try:
+        outcome = tsgt("compare", wrong if both else reference, wrong, *options)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+    assert (outcome.code, said in outcome.err) == (1 if said else 0, True), outcome.err
+
+
+def test_offset_beyond_the_length_of_the_drive_is_searched(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Times without overlap, of a clock an hour ahead, are no reason to refuse where the offset may be an hour."""
+    reference = write(tmp_path / "reference.tum")
+    late = write(tmp_path / "late.tum", shift_s=3600.0)
+    outcome = tsgt("compare", reference, late, "--max-offset-s", 4000, "--json")
+    assert outcome.code == 0, outcome.err
+    (found,) = outcome.json()["estimates"].values()
+    assert found["offset_ms"] == pytest.approx(-3.6e6, abs=1.0)
+    assert any("no overlap in time as stamped" in note for note in found["notes"])
+    for options in (("--max-offset-s", 3000), ("--max-offset-s", 4000, "--fit", "none")):
+        outcome = tsgt("compare", reference, late, *options)
+        assert (outcome.code, "no overlap in time: the estimate covers" in outcome.err) == (1, True)
+
+
+def test_limit_of_sigma_needs_a_covariance(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A TUM file as the reference has none: nothing could be left out."""
+    reference = write(tmp_path / "reference.tum")
+    outcome = tsgt("compare", reference, reference, "--max-sigma-mm", 5)
+    assert (outcome.code, "--max-sigma-mm needs" in outcome.err) == (2, True)
 
 
 @pytest.mark.slow

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import html
 import io
 import itertools
 import json
+import os
 import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import pytest
 from harness.drives.scene import at_rest, driving
@@ -17,7 +19,10 @@ from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, 
 from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import read_stationary_intervals
 from tsgt.analysis.report import Findings, collect_findings, map_figure, report_numbers, sections, verdicts
+from tsgt.analysis.report.page import Headline
+from tsgt.cli.desk.report import write_page
 from tsgt.cli.main import cli, run
+from tsgt.errors import OutputFileError
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -328,6 +333,32 @@ def test_recording_without_measurements_has_no_report(tsgt: Tsgt, tmp_path: Path
     assert outcome.code == 1
     assert "holds no measurements" in outcome.err
     assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize("command", ["evaluate", "compare"])
+@pytest.mark.parametrize("name", ["report.json", "report.html"])
+def test_report_does_not_replace_an_input(tsgt: Tsgt, tmp_path: Path, command: str, name: str) -> None:
+    """A file in the folder with the name of one of the report's is refused before any work."""
+    given = tmp_path / name
+    given.write_text("x", encoding="utf-8")
+    rest = [tmp_path / "estimate.tum"] if command == "compare" else []
+    outcome = tsgt(command, given, *rest, "--report", tmp_path)
+    assert (outcome.code, "would replace its own input" in outcome.err) == (2, True)
+    assert given.read_text(encoding="utf-8") == "x"
+
+
+def test_failing_report_keeps_the_previous_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Page and numbers are replaced by complete ones only."""
+    (tmp_path / "report.html").write_text("before", encoding="utf-8")
+
+    def full(_: int) -> NoReturn:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputFileError, match="No space left"):
+        write_page(tmp_path, "title", Headline((), (), (), ()), None, [], {})
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == "before"
 
 
 def test_report_needs_a_writable_folder(tsgt: Tsgt, tmp_path: Path) -> None:

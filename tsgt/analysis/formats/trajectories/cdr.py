@@ -29,11 +29,11 @@ POSE_NUMBERS = 7
 
 
 class Layout(NamedTuple):
-    """What a message begins with: its stamp, so many names, so many bytes, and so many doubles."""
+    """What a message begins with: its stamp, so many names, a NavSatStatus or not, and so many doubles."""
 
     names: int
     doubles: int
-    bytes_between: int = 0
+    has_status: bool = False
 
 
 class Stamped(NamedTuple):
@@ -50,7 +50,7 @@ LAYOUTS = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": Layout(1, POSE_NUMBERS + 36),
     "nav_msgs/msg/Odometry": Layout(2, POSE_NUMBERS + 36),
     "geometry_msgs/msg/PointStamped": Layout(1, 3),
-    "sensor_msgs/msg/NavSatFix": Layout(1, 3 + 9, bytes_between=4),
+    "sensor_msgs/msg/NavSatFix": Layout(1, 3 + 9, has_status=True),
 }
 
 
@@ -67,7 +67,8 @@ def decode_messages(
     for data in messages:
         check_encoding(data)
         stamp_ns, _, end = stamped_at(data, _ENCAPSULATION, layout.names)
-        start = _aligned(end + layout.bytes_between, _DOUBLE)
+        # A status is an int8 and a uint16 at an even offset.
+        start = _aligned(_aligned(end + 1, 2) + 2 if layout.has_status else end, _DOUBLE)
         part = data[start : start + size]
         if len(part) != size:
             raise ValueError("a message ends too early")

@@ -19,8 +19,10 @@ from harness.files.pose_files import (
     write_bag,
 )
 from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import Stores, get_typestore
 
 from tsgt.analysis.formats.trajectories import read_estimates
+from tsgt.analysis.formats.trajectories.cdr import LAYOUTS, decode_messages
 from tsgt.errors import InputFileError, MissingExtraError
 from tsgt.geometry import rotation_from_quaternion, transform_from
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 POSES = Poses(20)
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
 COVARIANCE = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) + 0.01
 LATE_NS = 7_000_000  # from stamp to recording
 
@@ -66,6 +69,17 @@ def test_topics_of_poses_round_trip(tmp_path: Path, plugin: StoragePlugin) -> No
                 np.testing.assert_array_equal(each.covariance, [COVARIANCE] * 20)
             else:
                 assert each.covariance is None
+
+
+@pytest.mark.parametrize("frame", ["", "g", "gps", "base", "gps_link", "navsat_link"])
+def test_fix_is_decoded_whatever_the_length_of_its_frame(frame: str) -> None:
+    """The numbers are aligned to eight bytes behind the names, against the message that rosbags decodes."""
+    message = fix(5_000_000_006, 46.5, -71.2, 100.0, status=2)
+    message.header.frame_id = frame
+    data = bytes(TYPES.serialize_cdr(message, "sensor_msgs/msg/NavSatFix"))
+    stamps, numbers, flags = decode_messages([data], LAYOUTS["sensor_msgs/msg/NavSatFix"])
+    assert (stamps.tolist(), flags.tolist()) == ([5_000_000_006], [2])
+    np.testing.assert_array_equal(numbers, [[46.5, -71.2, 100.0, *message.position_covariance]])
 
 
 def test_only_topic_is_found(tmp_path: Path) -> None:

@@ -328,6 +328,12 @@ constexpr std::int64_t kConnectTimeout = 5 * kSecond;
 constexpr std::int64_t kSilenceTimeout = 5 * kSecond;  // a relay sends something each second
 constexpr std::int64_t kFirstBackOff = kSecond / 10;
 constexpr std::int64_t kMaxBackOff = 2 * kSecond;
+constexpr std::int64_t kPrompt = kSecond / 10;  // what is read this soon after the socket was empty has arrived just now
+constexpr std::int64_t kSteady = kSecond / 20;  // a backlog is read when the offset has not fallen by this much in this time
+constexpr std::int64_t kUnknown = 2 * kSecond;  // how long poses wait for a line that tells the offset
+constexpr std::int64_t kMaxPause = 250 * kSecond;  // two clocks may drift apart by 50 ms in this time
+constexpr std::int64_t kNoOffset = INT64_MAX;
+constexpr std::size_t kMaxHeld = 4000;  // records; more than a queue of the master has
 constexpr std::size_t kMaxLine = (1 << 20) + 256;
 constexpr std::size_t kMaxHandshake = 512;
 constexpr std::size_t kDigits = 64;  // of a nonce, a key and a proof
@@ -543,6 +549,8 @@ class Stream {
       if (!connecting_ || connected(until)) receive(until);
     } catch (const detail::Lost& lost) {
       disconnect();
+      caught_up_ = true;  // nothing more will tell the age of what is held
+      release();
       failures_at_key_ = at_key_ ? failures_at_key_ + 1 : 0;  // the first time, the relay may have been busy
       at_key_ = false;
       if (failures_at_key_ >= 2 && !was_ready_) throw Error(source_ + ": the relay has another key, or has seen too many wrong ones");
@@ -575,13 +583,17 @@ class Stream {
       addrinfo* found = nullptr;
       const int error = getaddrinfo(host_.c_str(), port_.c_str(), &hints, &found);
       if (error != 0) throw detail::Lost(gai_strerror(error));
-      const addrinfo address = *found;
+      int count = 0;
+      for (const addrinfo* each = found; each != nullptr; each = each->ai_next) ++count;
+      const addrinfo* chosen = found;  // all in turn: a name may have addresses at which the relay does not listen
+      for (int i = attempts_++ % count; i > 0; --i) chosen = chosen->ai_next;
+      const addrinfo address = *chosen;
       sockaddr_storage storage{};
       std::memcpy(&storage, address.ai_addr, address.ai_addrlen);
       freeaddrinfo(found);
       open(address.ai_family, reinterpret_cast<const sockaddr*>(&storage), address.ai_addrlen);
     }
-    heard_ = monotonic_ns();
+    heard_ = empty_ = monotonic_ns();
     if (!over_relay()) ++connections_;
   }
 
@@ -613,19 +625,21 @@ class Stream {
   }
 
   void receive(std::int64_t until) {
-    std::int64_t deadline = until;
-    if (over_relay()) deadline = std::min(until, heard_ + (ready_ ? detail::kSilenceTimeout : detail::kConnectTimeout));
-    wait(socket_, POLLIN, deadline);
     std::array<char, 65536> data;
     const ssize_t count = recv(socket_, data.data(), data.size(), 0);
     if (count == 0) throw detail::Lost("the stream has ended");
     if (count < 0) {
       if (errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR) fail(errno);
-      if (over_relay() && monotonic_ns() >= heard_ + (ready_ ? detail::kSilenceTimeout : detail::kConnectTimeout))
-        throw detail::Lost("nothing arrives");
+      const std::int64_t now = monotonic_ns(), silent = heard_ + (ready_ ? detail::kSilenceTimeout : detail::kConnectTimeout);
+      if (over_relay() && now >= silent) throw detail::Lost("nothing arrives");
+      emptied(now);
+      if (!records_.empty()) return;
+      if (over_relay()) until = std::min(until, silent);
+      wait(socket_, POLLIN, caught_up_ || !steady_ ? until : std::min(until, steady_until()));
       return;
     }
     heard_ = monotonic_ns();
+    if (heard_ - empty_ > detail::kMaxPause) fall_behind();
     more_ = true;
     received_.append(data.data(), static_cast<std::size_t>(count));
     std::size_t start = 0;
@@ -634,6 +648,55 @@ class Stream {
     received_.erase(0, start);
     if (received_.size() > (over_relay() && !ready_ ? detail::kMaxHandshake : detail::kMaxLine))
       throw detail::Lost("a line is too long: not a stream of tsgt");
+    release();
+  }
+
+  // Poses wait in held_ until it is known how old they are. The offset of the clocks comes from lines that were read as soon as
+  // they arrived; of lines that piled up while the program was busy, each would be new by its own offset. So all that has piled
+  // up is read first, and the newest line dates it. An empty socket alone does not tell that, for the master sends the rest of
+  // its queue as the reader makes room.
+
+  void fall_behind() {
+    caught_up_ = false;
+    steady_.reset();
+  }
+
+  // An upper bound, from the master's clock to ours.
+  std::int64_t offset() const {
+    if (!session_.known()) return detail::kNoOffset;
+    return over_relay() ? network_.here(session_.here(0)) : session_.here(0);
+  }
+
+  std::int64_t steady_until() const {
+    return steady_->first + (steady_->second == detail::kNoOffset ? detail::kUnknown : detail::kSteady);
+  }
+
+  // All that had arrived has been read.
+  void emptied(std::int64_t now) {
+    const bool prompt = now - empty_ <= detail::kPrompt;
+    empty_ = now;
+    const std::int64_t offset_now = offset();
+    if (caught_up_ || (offset_now == detail::kNoOffset && held_.empty())) return;
+    if (!steady_ || offset_now < steady_->second - detail::kSteady) {
+      caught_up_ = prompt && !steady_ && offset_now != detail::kNoOffset;
+      steady_ = {now, offset_now};
+    } else if (now >= steady_until()) {
+      caught_up_ = true;
+    }
+    release();
+  }
+
+  void release() {
+    while (!held_.empty() &&
+           (caught_up_ || held_.size() > detail::kMaxHeld || !std::holds_alternative<Pose>(held_.front()))) {
+      if (auto* pose = std::get_if<Pose>(&held_.front())) {
+        if (session_.known()) pose->epoch_ns = session_.here(pose->stamp_ns);
+        if (over_relay()) pose->epoch_ns = network_.here(pose->epoch_ns);
+        if (pose->kind != "smoothed") latest_ = *pose;
+      }
+      records_.push_back(std::move(held_.front()));
+      held_.pop_front();
+    }
   }
 
   void take(std::string_view line) {
@@ -659,7 +722,7 @@ class Stream {
   void answer(std::string_view line) {
     const std::string prefix = std::string(detail::kRelay) + " ";
     if (line.substr(0, 11) != "tsgt-relay ") throw detail::Lost("no relay of tsgt answers there, or it uses TLS");
-    if (line.substr(0, prefix.size()) != prefix) throw Error(source_ + ": the relay has another protocol version than 1");
+    if (line.substr(0, prefix.size()) != prefix) throw detail::Lost("the relay has another protocol version than 1");
     challenge_ = line;
     const bool place = resume_ && !stream_.empty();
     request_ = detail::hex(detail::random_bytes(32)) + " " + (place ? stream_ + " " + std::to_string(next_) : "- -");
@@ -715,7 +778,7 @@ class Stream {
     return detail::hex(detail::hmac(key_, std::string(detail::kRelay) + " " + role + "\n-\n" + lines));
   }
 
-  void gap(std::optional<std::int64_t> lines, const std::string& reason) { records_.emplace_back(Gap{lines, reason}); }
+  void gap(std::optional<std::int64_t> lines, const std::string& reason) { held_.emplace_back(Gap{lines, reason}); }
 
   void decode(std::string_view text, std::int64_t arrived) {
     try {
@@ -723,10 +786,12 @@ class Stream {
       const std::string& type = line["type"].text();
       if (type == "hello") {
         if (line["protocol"].integer() != detail::kProtocol) throw Error(source_ + ": the stream has another protocol version than 1");
-        greeted_ = true;
+        greeted_ = caught_up_ = true;
+        release();  // by the clock of the session that they are of
+        fall_behind();
         session_ = detail::LeastDelay();  // the Unix clock of the next session may differ
         latest_.reset();
-        records_.emplace_back(Hello{line["version"].text()});
+        held_.emplace_back(Hello{line["version"].text()});
         return;
       }
       if (!greeted_) throw std::invalid_argument("no greeting");
@@ -740,10 +805,10 @@ class Stream {
                     detail::optional_integer(line["station"]), detail::optional_integer(line["count"])};
         const bool lost = event.event == "lines_lost";
         const auto count = event.count;
-        records_.emplace_back(std::move(event));
+        held_.emplace_back(std::move(event));
         if (lost) gap(count, "this reader was too slow for the master");
       } else {
-        records_.emplace_back(Other{type, line});
+        held_.emplace_back(Other{type, line});
       }
     } catch (const std::invalid_argument& error) {
       if (!greeted_) throw Error(source_ + ": not a stream of tsgt");
@@ -769,18 +834,18 @@ class Stream {
     pose.velocity_mps = detail::numbers<3>(line["velocity_mps"]);
     pose.angular_velocity_radps = detail::numbers<3>(line["angular_velocity_radps"]);
     pose.residual_m = detail::optional_number(line["residual_m"]);
-    const std::int64_t at = session_.known() ? session_.here(pose.stamp_ns) : arrived;
-    pose.epoch_ns = over_relay() ? network_.here(at) : at;
-    if (pose.kind != "smoothed") latest_ = pose;
-    records_.emplace_back(std::move(pose));
+    pose.epoch_ns = arrived;  // until it is dated
+    held_.emplace_back(std::move(pose));
   }
 
   std::string source_, host_, port_, key_, line_key_, stream_, challenge_, request_, received_, problem_;
   bool resume_, connecting_ = false, more_ = false, ready_ = false, was_ready_ = false, at_key_ = false, greeted_ = false;
-  int socket_ = -1, connections_ = 0, failures_at_key_ = 0;
-  std::int64_t next_ = 0, last_beat_ = 0, heard_ = 0, retry_ = 0, back_off_ = detail::kFirstBackOff;
+  bool caught_up_ = false;
+  int socket_ = -1, connections_ = 0, failures_at_key_ = 0, attempts_ = 0;
+  std::int64_t next_ = 0, last_beat_ = 0, heard_ = 0, empty_ = 0, retry_ = 0, back_off_ = detail::kFirstBackOff;
   detail::LeastDelay session_, network_;
-  std::deque<Record> records_;
+  std::optional<std::pair<std::int64_t, std::int64_t>> steady_;  // since when the offset has stayed the same, and the offset
+  std::deque<Record> held_, records_;
   std::optional<Pose> latest_;
 };
 

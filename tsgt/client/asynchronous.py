@@ -69,8 +69,10 @@ class AsyncStream(StreamBase):
     def latest(
         self, series: str = LIVE, *, max_age_s: float | None = None, include_invalid: bool = False
     ) -> Pose | None:
-        """Return the newest pose; None if it is stale, invalid or missing."""
+        """Return the newest pose; None if it is stale, invalid or missing. Raises StreamError as an iteration does."""
         self._start()
+        if self._error is not None:
+            raise self._error
         return self._newest_pose(series, max_age_s, include_invalid=include_invalid)
 
     def _start(self) -> None:

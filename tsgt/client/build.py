@@ -13,6 +13,8 @@ from tsgt.errors import StreamError
 
 T = TypeVar("T")
 
+INTEGER_BITS = 63  # without the sign; the ages of larger times would be beyond a double
+
 _SHOWN_CHARACTERS = 80
 
 TYPES: dict[str, type[Hello | Setup | Pose | Measurement | Status | Event]] = {
@@ -65,7 +67,9 @@ def build(cls: type[T], data: dict[str, Any], **more: Any) -> T:
                 value = _tuples(value)
             elif not isinstance(value, _json_types(field)):
                 raise TypeError(f"{_shown(repr(value).encode())} is not {field.type}")
-        except (TypeError, ValueError) as error:
+            elif isinstance(value, int) and value.bit_length() > INTEGER_BITS:
+                raise ValueError("beyond 64 bits")
+        except (TypeError, ValueError, OverflowError, RecursionError) as error:
             raise StreamError(
                 f"the field {name} of a line of type {data.get('type')} is wrong: {error}"
             ) from error

@@ -15,6 +15,7 @@ import threading
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from tsgt.client.backlog import Backlog
 from tsgt.client.decoder import Decoder, ProtocolVersionError
 from tsgt.client.links import Arrival, Link, RelayLink, SocketLink
 from tsgt.client.records import Gap, Record, monotonic_ns
@@ -81,6 +82,7 @@ class Pump:
                 raise StreamError(f"{source}: a relay needs its key")
             self._link = RelayLink(key, lambda: os.urandom(NONCE_BYTES), resume=resume)
         self._decoder = Decoder(self._link)
+        self._backlog = Backlog(self._decoder, now_ns())
         self._reconnect = reconnect
         self._now_ns = now_ns
         self._socket: socket.socket | None = None
@@ -95,50 +97,64 @@ class Pump:
         self._was_ready = False
         self._failures_at_key = 0
         self._logged: set[str] = set()
-        self.ended = False
-        """Whether nothing will follow."""
+        self._over = False
         self.more = False
-        """Whether the last step left data that had arrived."""
+        """Whether the next step is due at once: the last one may have left data, or records."""
         self.problem = ""
         """Why there is no connection, in one line; empty while there is one."""
 
+    @property
+    def ended(self) -> bool:
+        """Whether nothing will follow."""
+        return self._over and not self._backlog.left
+
     def step(self) -> list[Record]:
-        """Connect, send and receive as far as possible at once; return what arrived.
+        """Connect, send and receive as far as possible at once; return what arrived, unless its age is not known yet.
 
         Raises StreamError where another attempt does not help: another protocol, a wrong key at the first connection,
         any failure without reconnection.
         """
-        records: list[Record] = []
         self.more = False
-        if self.ended:
-            return records
-        try:
-            if self._socket is None and self._now_ns() >= self._retry_ns:
-                self._connect()
-            if self._socket is not None and self._connected():
-                self._exchange(records)
-            self._check_silence()
-        except ProtocolVersionError:
-            self.close()
-            raise
-        except OSError as error:  # also StreamError
-            self._lost(error)
+        if not (self._over or self._backlog.left):
+            self._advance()
+        records = self._backlog.take()
+        self.more = self.more or self._backlog.left
         return records
 
     def wait_for(self) -> WaitFor:
         """Return what to wait for before the next step."""
+        if self.more:
+            return WaitFor(None, write=False, until_ns=self._now_ns())
         if self._resolver is not None:
             return WaitFor(self._resolver.descriptor, write=False, until_ns=None)
         if self._socket is None:
             return WaitFor(None, write=False, until_ns=self._retry_ns)
+        times_ns = (self._deadline_ns(), self._backlog.until_ns)
         return WaitFor(
-            self._socket.fileno(), self._connecting or bool(self._outgoing), until_ns=self._deadline_ns()
+            self._socket.fileno(),
+            self._connecting or bool(self._outgoing),
+            until_ns=min((time_ns for time_ns in times_ns if time_ns is not None), default=None),
         )
 
     def close(self) -> None:
         """Close the connection for good."""
-        self.ended = True
+        self._over = True
+        self._backlog.clear()
         self._disconnect()
+
+    def _advance(self) -> None:
+        try:
+            if self._socket is None and self._now_ns() >= self._retry_ns:
+                self._connect()
+            if self._socket is not None and self._connected():
+                self._exchange()
+            self._check_silence()
+        except ProtocolVersionError as error:
+            self.problem = f"{self._source}: {error}"
+            self.close()
+            raise
+        except OSError as error:  # also StreamError
+            self._lost(error)
 
     def _connect(self) -> None:
         source = self._source
@@ -161,6 +177,7 @@ class Pump:
         self._socket = socket.socket(family, socket.SOCK_STREAM)
         self._socket.setblocking(False)
         self._received_ns = self._now_ns()
+        self._backlog.connected(self._received_ns)
         self._connecting = True
         code = self._socket.connect_ex(address)
         if code not in (0, errno.EINPROGRESS):
@@ -186,22 +203,24 @@ class Pump:
             self._link.connected(NO_CHANNEL)
         return True
 
-    def _exchange(self, records: list[Record]) -> None:
+    def _exchange(self) -> None:
         assert self._socket is not None  # noqa: S101 (its caller has looked)
         for _ in range(MAX_RECEIVES):
             self._send()
             try:
                 data = self._socket.recv(RECEIVE_BYTES)
             except BlockingIOError:
+                self._backlog.emptied(self._now_ns())
                 return
             if not data:
                 raise StreamError("the stream has ended")
             self._received_ns = self._now_ns()
-            self._take(data, records)
+            self._backlog.received(self._received_ns)
+            self._take(data)
         self._send()
         self.more = True
 
-    def _take(self, data: bytes, records: list[Record]) -> None:
+    def _take(self, data: bytes) -> None:
         if self._tls is not None:
             was_open = self._tls.open
             data = self._tls.receive(data)
@@ -216,24 +235,25 @@ class Pump:
                 else:
                     self._outgoing += item
             elif isinstance(item, Gap):
-                records.append(item)
+                self._backlog.put(item)
             else:
-                self._decode(item, records)
+                self._decode(item)
         if self._link.ready:
             self._was_ready = True
             self._back_off_s = BACK_OFF_S[0]
             self._logged.clear()
             self.problem = ""
 
-    def _decode(self, arrival: Arrival, records: list[Record]) -> None:
+    def _decode(self, arrival: Arrival) -> None:
         try:
-            records.extend(self._decoder.decode(arrival))
+            for record in self._decoder.decode(arrival):
+                self._backlog.put(record)
         except ProtocolVersionError:
             raise
         except StreamError as error:
             if not self._decoder.greeted:
                 raise
-            records.append(Gap(lines=1, reason=str(error)))
+            self._backlog.put(Gap(lines=1, reason=str(error)))
 
     def _send(self) -> None:
         assert self._socket is not None  # noqa: S101 (its caller has looked)
@@ -261,22 +281,23 @@ class Pump:
     def _lost(self, error: OSError) -> None:
         self._failures_at_key = self._failures_at_key + 1 if self._link.failed_at_key else 0
         self._disconnect()
+        self._backlog.ended()
         reason = str(error) if isinstance(error, StreamError) else error.strerror or str(error)
-        problem = f"{self._source}: {reason}"
+        self.problem = problem = f"{self._source}: {reason}"
         if self._failures_at_key >= MAX_FAILURES_AT_KEY and not self._was_ready:
-            self.ended = True
-            raise AuthenticationError(
+            self._over = True
+            self.problem = (
                 f"{self._source}: the relay has another key, or has seen too many attempts with wrong ones"
-            ) from error
+            )
+            raise AuthenticationError(self.problem) from error
         if not self._reconnect:
-            self.ended = True
+            self._over = True
             if self._was_ready and reason == "the stream has ended":
                 return
             raise StreamError(problem) from error
         if problem not in self._logged:
             self._logged.add(problem)
             log.warning("no stream: %s; trying again", problem)
-        self.problem = problem
         self._retry_ns = self._now_ns() + round(self._back_off_s * 1e9)
         self._back_off_s = min(2 * self._back_off_s, BACK_OFF_S[1])
 

@@ -2,7 +2,7 @@
 
 A reader that stalls must cost the others nothing, and know that it has lost lines: behind the buffers of kernel and
 transport each has a queue, which drops its oldest line when full, and the reader gets an event ``lines_lost`` with the
-number. There are no tasks: lines are sent from :meth:`StreamServer.publish` and the event loop's callbacks.
+number, and the newest ``setup`` of the dropped lines, which is not sent otherwise until it changes. There are no tasks: lines are sent from :meth:`StreamServer.publish` and the event loop's callbacks.
 """
 
 from __future__ import annotations
@@ -178,6 +178,8 @@ class _Reader(asyncio.Protocol):
         self._unix_now_ns = unix_now_ns
         self._paused = False
         self._lost = 0
+        self._lost_setup = b""
+        """The newest ``setup`` among the lost lines; not counted in them, for it is sent behind them."""
 
     @property
     def waiting(self) -> bool:
@@ -192,8 +194,10 @@ class _Reader(asyncio.Protocol):
             self._transport.write(data)
             return
         if self.full:
-            self._queue.popleft()
-            self._lost += 1
+            dropped = self._queue.popleft()
+            if dropped.startswith(SETUP_START):
+                self._lost_setup, dropped = dropped, self._lost_setup
+            self._lost += bool(dropped)
         self._queue.append(data)
 
     def close(self) -> None:
@@ -232,6 +236,9 @@ class _Reader(asyncio.Protocol):
             log.warning("reader_lost_lines", count=self._lost)
             self._transport.write(encode_line(self._lines_lost()) + b"\n")
             self._lost = 0
+        if self._lost_setup:
+            self._transport.write(self._lost_setup)
+            self._lost_setup = b""
         while self._queue and not self._paused:
             self._transport.write(self._queue.popleft())
         self._changed.set()

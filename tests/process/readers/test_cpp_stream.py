@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
+import socket
 import subprocess
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -121,6 +123,128 @@ def test_latest_pose_becomes_stale(tmp_path: Path) -> None:
     assert all(step > 0 and step % PERIOD_NS == 0 for step in steps)
     assert steps.count(PERIOD_NS) > len(steps) // 2
     assert poses[-1] <= master.first_ns + (master.sent - 1) * PERIOD_NS
+
+
+LATE = """
+#include <cinttypes>
+#include <cstdio>
+#include "tsgt_stream.hpp"
+
+// A computer with two addresses, at the first of which nobody listens.
+extern "C" int getaddrinfo(const char*, const char* port, const addrinfo*, addrinfo** found) {
+  static sockaddr_in addresses[2];
+  static addrinfo entries[2];
+  for (int i = 0; i < 2; ++i) {
+    addresses[i].sin_family = AF_INET;
+    addresses[i].sin_port = htons(static_cast<std::uint16_t>(std::atoi(port)));
+    addresses[i].sin_addr.s_addr = htonl(i == 0 ? 0x7f000002 : INADDR_LOOPBACK);
+    entries[i].ai_family = AF_INET;
+    entries[i].ai_addr = reinterpret_cast<sockaddr*>(&addresses[i]);
+    entries[i].ai_addrlen = sizeof(sockaddr_in);
+    entries[i].ai_next = i == 0 ? &entries[1] : nullptr;
+  }
+  *found = entries;
+  return 0;
+}
+extern "C" void freeaddrinfo(addrinfo*) noexcept {}
+
+int main(int argc, char** argv) {
+  tsgt::Stream stream(argv[1], argc > 2 ? argv[2] : "");
+  stream.latest(0.2);
+  std::puts("connected");
+  std::fflush(stdout);
+  std::getchar();
+  std::string problem;
+  while (true) {
+    const auto record = stream.next(std::chrono::milliseconds(5));
+    if (stream.problem() != problem) std::puts((problem = stream.problem()).c_str());
+    if (record)
+      if (const auto* pose = std::get_if<tsgt::Pose>(&*record)) std::printf("%" PRId64 " %.3f\\n", pose->stamp_ns, pose->age_s());
+    std::fflush(stdout);
+  }
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Compile a program that connects, and reads when it gets a character."""
+    folder = tmp_path_factory.mktemp("late")
+    (folder / "late.cpp").write_text(LATE)
+    subprocess.run(
+        [GXX, "-std=c++17", "-I", str(FOLDER), "-o", str(folder / "late"), str(folder / "late.cpp")],
+        check=True,
+    )
+    return folder / "late"
+
+
+@contextmanager
+def begun(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
+    """Run a program that has connected and waits for a character."""
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as program:
+        try:
+            assert program.stdout is not None
+            assert program.stdout.readline() == "connected\n"
+            yield program
+        finally:
+            program.kill()
+
+
+def read_now(program: subprocess.Popen[str], lines_: int) -> list[str]:
+    """Let the program read; returns the first lines that it prints."""
+    assert program.stdin is not None
+    assert program.stdout is not None
+    program.stdin.write("\n")
+    program.stdin.flush()
+    return [program.stdout.readline().rstrip("\n") for _ in range(lines_)]
+
+
+def test_backlog_after_the_connection_is_not_taken_for_new(late: Path, tmp_path: Path) -> None:
+    """A program that connects and is busy: the newest of the lines that wait dates the others."""
+    poses = [replace(AWKWARD, stamp_ns=POSE.stamp_ns + number * PERIOD_NS) for number in range(61)]
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "s"))
+        listener.listen()
+        with begun(late, tmp_path / "s") as program, listener.accept()[0] as connection:
+            time.sleep(0.2)  # the header has the clock of the computer; what is read sooner counts as new
+            connection.sendall(lines(HELLO, *poses))
+            printed = [line.split() for line in read_now(program, len(poses))]
+    assert [int(stamp) for stamp, _ in printed] == [pose.stamp_ns for pose in poses]
+    ages_s = [float(age) for _, age in printed]
+    assert ages_s[0] >= 3.0
+    assert ages_s[30] >= 1.5
+
+
+def test_smoothed_pose_before_all_else_has_its_age(late: Path, tmp_path: Path) -> None:
+    """Its arrival says nothing of its epoch, so it waits for a line that does."""
+    smoothed = replace(POSE, kind="smoothed")
+    predicted = replace(POSE, kind="predicted", stamp_ns=POSE.stamp_ns + 3_000_000_000)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "s"))
+        listener.listen()
+        with begun(late, tmp_path / "s") as program, listener.accept()[0] as connection:
+            connection.sendall(lines(HELLO, smoothed, predicted))
+            stamp, age = read_now(program, 1)[0].split()
+    assert int(stamp) == smoothed.stamp_ns
+    assert float(age) >= 3.0
+
+
+def test_all_addresses_are_tried_and_another_version_is_no_end(late: Path, tmp_path: Path) -> None:
+    """Nobody has proved anything with the first line, so the next attempt may find the relay."""
+    write_key(tmp_path / "relay.key")
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.settimeout(TIMEOUT_S)
+        address = f"relay://robot:{listener.getsockname()[1]}"
+        with begun(late, address, tmp_path / "relay.key") as program:
+            read_now(program, 0)
+            for _ in range(2):
+                with listener.accept()[0] as connection:
+                    connection.sendall(b"tsgt-relay 2 " + b"11" * 32 + b"\n")
+                    assert connection.recv(1) == b""
+            program.kill()
+            assert program.stdout is not None
+            reasons = {line.removeprefix(f"{address}: ").rstrip() for line in program.stdout}
+    assert reasons == {"Connection refused", "the relay has another protocol version than 1"}
 
 
 def test_gaps_events_and_reasons_are_told(program: Path, tmp_path: Path) -> None:

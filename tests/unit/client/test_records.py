@@ -121,11 +121,24 @@ def test_unknown_keys_are_ignored() -> None:
         {"stamp_ns": 1.5},
         {"stations": [1]},
         {"stations": [{"id": 1}]},
+        {"position_m": [10**400, 0, 0]},
+        {"residual_m": 10**400},
+        {"stamp_ns": -(2**63) - 1},
     ],
 )
 def test_wrong_fields_are_rejected(change: dict[str, Any]) -> None:
     """They never become a pose."""
     data = load(encode_line(POSE)) | change
+    with pytest.raises(StreamError):
+        build(Pose, data)
+
+
+def test_deep_lists_are_rejected() -> None:
+    """Also those that the parser of JSON still takes."""
+    nested: list[Any] = []
+    for _ in range(2000):
+        nested = [nested]
+    data = load(encode_line(POSE)) | {"degraded_by": nested}
     with pytest.raises(StreamError):
         build(Pose, data)
 

@@ -153,6 +153,32 @@ async def test_slow_reader_gets_the_number_of_lost_lines(path: Path) -> None:
     assert records[at]["count"] == 190 - at > 100
 
 
+async def test_slow_reader_gets_a_lost_setup(path: Path) -> None:
+    """The newest one, once, in its place behind the event; it does not count as lost, and those before it do."""
+
+    def setup(number: int) -> bytes:
+        return b'{"type":"setup","stamp_ns":%d}' % number
+
+    async with StreamServer(path, HELLO, queue_lines=10, unix_now_ns=lambda: 77) as server:
+        sleepy = SleepyClient(path)
+        await server.wait_for_reader()
+        for last in (199, 399, 599):
+            for number in range(last - 199, last + 1):
+                if number in (150, 160, 350, 396):
+                    server.publish(setup(number))
+                server.publish(line(number, BIG))
+            while not sleepy.records() or sleepy.records()[-1].get("number") != last:
+                sleepy.take()
+                await settle()
+        sleepy.socket.close()
+    told = [
+        record.get("event", record.get("stamp_ns")) for record in sleepy.records() if record["type"] != "test"
+    ]
+    assert told == ["lines_lost", 160, "lines_lost", 350, 396, "lines_lost"]
+    counts = [record["count"] for record in sleepy.records() if record.get("event")]
+    assert sum(counts) + len(sleepy.records()) - len(counts) == 604
+
+
 async def test_slow_reader_does_not_affect_others(path: Path) -> None:
     """While one reader loses lines, another one gets all of them."""
     async with StreamServer(path, HELLO, queue_lines=10) as server:

@@ -41,6 +41,7 @@ StartCheck = Callable[[Callable[[], SetupCheck]], Callable[[], SetupCheck]]
 WINDOW_NS = 50_000_000_000
 FIRST_NS = 12_000_000_000  # Of measurements before the first check: fewer do not tell the mounting
 UNCONFIRMED_INTERVAL_NS = 4_000_000_000
+SILENT_NS = 1_000_000_000  # Without a record for this long the measurements' time bounds the records, too
 INTERVAL_NS = 20_000_000_000
 RESULT_NS = 2_000_000_000  # From the start of a check to its result; a slow computer takes a second
 
@@ -215,6 +216,8 @@ class ImuSetupMonitor:
         self._measurements.append(measurement)
         while self._measurements[0].received_ns < now_ns - WINDOW_NS:
             self._measurements.popleft()
+        while self._records and self._records[0].received_ns < now_ns - WINDOW_NS - SILENT_NS:
+            self._records.popleft()
         if self._next_ns is None:
             self._next_ns = now_ns + FIRST_NS
         if self._result is not None and now_ns >= self._result_ns:

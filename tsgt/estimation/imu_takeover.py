@@ -316,13 +316,18 @@ class ImuTakeover:
     def add_samples(self, record: ImuSamples) -> None:
         """Take samples; before the first measurement only the newest are kept."""
         self._records.append(record)
-        while self._records[0].received_ns < record.received_ns - _KEPT_BEFORE_START_NS:
+        while (
+            self._converter is None
+            and self._records[0].received_ns < record.received_ns - _KEPT_BEFORE_START_NS
+        ):
             self._records.popleft()
 
     def add_odometry(self, record: OdometrySamples) -> None:
         """Take samples of the wheel odometry; before the first measurement only the newest are kept."""
         self._driven.append(record)
-        while self._driven[0].received_ns < record.received_ns - _KEPT_BEFORE_START_NS:
+        while (
+            self._wheels is None and self._driven[0].received_ns < record.received_ns - _KEPT_BEFORE_START_NS
+        ):
             self._driven.popleft()
 
     def take_samples(self) -> None:
@@ -353,6 +358,8 @@ class ImuTakeover:
     def choose(self, now_s: float) -> None:
         """Choose the window for poses that are sent at a time."""
         self._now_s = now_s
+        if self._without.converged or self._unaided_from_s is None:
+            self._unaided_from_s = now_s
         if self.use == ImuUse.USED and now_s >= self._next_comparison_s:
             self._next_comparison_s = now_s + COMPARISON_INTERVAL_S
             self._compare(now_s)
@@ -375,7 +382,7 @@ class ImuTakeover:
             self._quarantine_s = max(self._quarantine_s, QUARANTINE_S)
             self._sound_from_s = now_s + self._quarantine_s
         elif found == ImuUse.SILENT:
-            self._sound_from_s = now_s + SOUND_S
+            self._sound_from_s = max(self._sound_from_s, now_s + SOUND_S)
         elif now_s < self._sound_from_s:
             found = self.use
         if found != ImuUse.USED:
@@ -428,8 +435,7 @@ class ImuTakeover:
         """Whether the IMU is not to be used yet. Where no three prisms are measured there is nothing else."""
         if self._setup is None or self._setup.confirmed:
             return False
-        if self._without.converged or self._unaided_from_s is None:
-            self._unaided_from_s = now_s
+        assert self._unaided_from_s is not None  # noqa: S101 (choose sets it)
         return now_s - self._unaided_from_s < (UNAIDED_S if self._prisms >= MIN_PRISMS else 0.0)
 
     @property

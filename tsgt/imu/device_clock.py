@@ -3,6 +3,9 @@
 A sample arrives after a delay that varies above a minimum, so that "arrival less device time" lies above a line, the lower
 envelope. Only the fastest samples shape it: a burst that arrives late changes nothing. None can arrive early: samples
 below the envelope mean that the device's clock was set.
+
+The skew of a crystal is below 0.1 %, so that some samples tell the time. A clock whose samples show more, that of a ceramic
+resonator, has the bounds of a counter, 5 %. One beyond these is no clock: it is never initialised.
 """
 
 from __future__ import annotations
@@ -25,9 +28,14 @@ INITIAL_NS = 500_000_000
 
 _MAX_SKEW = 1e-3
 _SKEW_SIGMA = 1e-4
+_COUNTER_INITIAL_NS = 4 * INITIAL_NS
 _MAX_COUNTER_SKEW = 0.05
 _COUNTER_SKEW_SIGMA = 0.02
 """Bound and sigma of the skew before it was measured: of a clock, and of a counter times its nominal period."""
+
+_CERTAIN_SIGMAS = 5.0
+_EVIDENCE_NS = 1e9
+"""A clock has the bounds of a counter once its skew has exceeded its own by so many sigmas, for so long after the first fit."""
 
 _MIN_SCALE_NS = 2_000.0  # jitter of the arrival itself
 _DELAY_CAP = 4.0  # a delay counts as at most this many mean delays: a stall says nothing about the others
@@ -66,9 +74,10 @@ class DeviceClock:
     """
 
     def __init__(self, *, counter: bool = False) -> None:
-        self._max_skew = _MAX_COUNTER_SKEW if counter else _MAX_SKEW
-        self._skew_sigma = _COUNTER_SKEW_SIGMA if counter else _SKEW_SIGMA
-        self._initial_ns = 4 * INITIAL_NS if counter else INITIAL_NS
+        self._max_skew, self._skew_sigma = _MAX_SKEW, _SKEW_SIGMA
+        self._initial_ns = INITIAL_NS
+        if counter:
+            self._widen()
         self._skew = 0.0
         self.steps = 0
         self.reset()
@@ -81,6 +90,7 @@ class DeviceClock:
         self._height = self._mean_delay = 0.0
         self._fitted_x = self._correction = self._stamped_x = 0.0
         self._early: list[tuple[int, int]] = []
+        self._beyond_from = math.inf
         self.initialised = False
 
     @property
@@ -125,6 +135,8 @@ class DeviceClock:
             self._fit()
             self._correction += before - self._line(x)
             self._fitted_x = x
+            if self._is_no_clock:
+                self._begin_again((device_ns, arrived_ns))
         return True
 
     def stamp(self, device_ns: int) -> int:
@@ -152,13 +164,43 @@ class DeviceClock:
         points = [self._coordinates(*sample) for sample in self._initial]
         lowest = min(y - self._skew * x for x, y in points)
         self._mean_delay = sum(y - self._skew * x for x, y in points) / len(points) - lowest
-        self._solve(points, points)
+        centre = sum(x for x, _ in points) / len(points)
+        if not self._wide and (line := self._line_beyond(points, centre, len(points))) is not None:
+            if self._initial_ns < _COUNTER_INITIAL_NS:  # More samples tell whether these were late by chance
+                self._initial_ns = _COUNTER_INITIAL_NS
+                return
+            if not _reaches(line, points):
+                self._begin_again(self._initial[-1])
+                return
+            self._widen()
+        self._solve(points, centre, len(points))
         for x, y in points:
             self._put(x, y)
-        self._initial = []
         self._fit()
+        if self._is_no_clock:
+            self._begin_again(self._initial[-1])
+            return
+        self._initial = []
         self._fitted_x = self._stamped_x = points[-1][0]
         self.initialised = True
+
+    @property
+    def _wide(self) -> bool:
+        return self._max_skew == _MAX_COUNTER_SKEW
+
+    def _widen(self) -> None:
+        """Take the bounds of a counter."""
+        self._max_skew, self._skew_sigma = _MAX_COUNTER_SKEW, _COUNTER_SKEW_SIGMA
+        self._initial_ns = _COUNTER_INITIAL_NS
+
+    @property
+    def _is_no_clock(self) -> bool:
+        """Whether the skew is at the widest bound, or beyond: the samples lie on no line that is possible."""
+        return abs(self._skew) >= 0.999 * _MAX_COUNTER_SKEW
+
+    def _begin_again(self, sample: tuple[int, int]) -> None:
+        self.reset()
+        self._skew, self._initial = 0.0, [sample]
 
     def _put(self, x: float, y: float) -> None:
         """Put a sample into its bin."""
@@ -182,13 +224,41 @@ class DeviceClock:
         points = [(each.x, each.y) for each in bins]
         lowest = min(y - self._skew * x for x, y in points)
         self._mean_delay = mean[1] - self._skew * mean[0] - lowest
-        self._solve(points, [mean], samples)
+        self._solve(points, mean[0], samples)
+        if not self._wide and self._has_shown_more(points, mean[0], samples):
+            self._widen()
+            self._solve(points, mean[0], samples)
 
-    def _solve(
-        self, points: list[tuple[float, float]], all_points: list[tuple[float, float]], samples: int = 0
-    ) -> None:
-        centre = sum(x for x, _ in all_points) / len(all_points)
-        scale = max(self._mean_delay / (samples or len(all_points)), _MIN_SCALE_NS)
+    def _has_shown_more(self, points: list[tuple[float, float]], centre: float, samples: int) -> bool:
+        """Whether fits of some seconds have shown a skew beyond the bound of a clock."""
+        line = self._line_beyond(points, centre, samples)
+        if line is None or not _reaches(line, points):
+            self._beyond_from = math.inf
+            return False
+        now = sum(points[-1])  # Of arrival: late samples arrive at once
+        self._beyond_from = min(self._beyond_from, now)
+        return now - self._beyond_from >= _EVIDENCE_NS
+
+    def _line_beyond(
+        self, points: list[tuple[float, float]], centre: float, samples: int
+    ) -> tuple[float, float] | None:
+        """Return height and slope of the line by points alone, if its skew is certainly beyond the bound of a clock."""
+        line = fit_lower_envelope(
+            points,
+            centre=centre,
+            scale=self._scale(samples),
+            prior=(0.0, _COUNTER_SKEW_SIGMA),
+            max_slope=_MAX_COUNTER_SKEW,
+        )
+        if abs(line.slope) - _CERTAIN_SIGMAS * line.slope_sigma <= _MAX_SKEW:
+            return None
+        return line.height, line.slope
+
+    def _scale(self, samples: int) -> float:
+        return max(self._mean_delay / samples, _MIN_SCALE_NS)
+
+    def _solve(self, points: list[tuple[float, float]], centre: float, samples: int) -> None:
+        scale = self._scale(samples)
         line = fit_lower_envelope(
             points, centre=centre, scale=scale, prior=(0.0, self._skew_sigma), max_slope=self._max_skew
         )
@@ -203,3 +273,10 @@ class DeviceClock:
             max_slope=self._max_skew / 100,
         )
         self._height, self._skew = fine.height, slope + fine.slope
+
+
+def _reaches(line: tuple[float, float], points: list[tuple[float, float]]) -> bool:
+    """Whether newest points are near a line: a stall that is being caught up leaves all of them far above any."""
+    height, slope = line
+    newest = [y - slope * x for x, y in points if x > points[-1][0] - INITIAL_NS / 2]
+    return min(newest) - height < STEP_NS

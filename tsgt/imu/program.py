@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -203,7 +204,8 @@ class Imu(DeviceProgram):
         problem = "" if session is None else session.status.problem
         if self._monitor.lost(self._now_ns()):
             problem = problem or self._error or self._rejected.last or "there are no samples yet"
-        return self._monitor.status(self._now_ns(), problem, self._sampler.clock_skew_ppm)
+        status = self._monitor.status(self._now_ns(), problem, self._sampler.clock_skew_ppm)
+        return replace(status, device=printable(status.device))
 
     def _hello(self, hello: HelloLine) -> None:
         name = printable(" ".join(filter(None, (hello.make, hello.model, hello.serial_number))))

@@ -26,7 +26,7 @@ from tsgt.master.classic import ClassicLink
 from tsgt.master.imu_monitor import ImuUseMonitor, OdometryUseMonitor
 from tsgt.master.link_events import MasterEvent
 from tsgt.master.observers import GeofenceObserver, layout_monitor
-from tsgt.master.publisher import Publisher
+from tsgt.master.publisher import Observer, Publisher
 from tsgt.master.reacquisition_hints import ReacquisitionHints
 from tsgt.master.recording_thread import RecordingDisk, RecordingThread, disk_status
 from tsgt.master.reload import reloading, usable_setup
@@ -176,16 +176,19 @@ async def run_master(
         try:
             async with server, asyncio.TaskGroup() as group:
                 stations = [station.station for station in config.stations]
-                observers = [
-                    ImuUseMonitor(),
+                lasting = [
                     OdometryUseMonitor(),
                     *(GeofenceObserver(geofence, group) for geofence in config.geofences),
                 ]
+
+                def observers(found: Parameters) -> list[Observer]:
+                    return [layout_monitor(config.frame_watch, found), ImuUseMonitor(), *lasting]
+
                 publisher = Publisher(
                     parameters,
                     Statistics(stations, read_target_checks(config.recording.directory)),
                     StationEventDetector(stations, start_ns),
-                    [layout_monitor(config.frame_watch, parameters), *observers],
+                    observers(parameters),
                     emit,
                     unix_now_ns,
                     dependencies.start_check or (lambda work: checks.submit(work).result),
@@ -201,9 +204,7 @@ async def run_master(
                 link = _link(config, hints, settings, timeline, recording, publisher, dependencies)
 
                 def set_up(found: Parameters) -> None:
-                    publisher.set_up(
-                        found, [layout_monitor(config.frame_watch, found), *observers], recording.put
-                    )
+                    publisher.set_up(found, observers(found), recording.put)
                     hints.set_up(found)
                     server.greet_with(encode_line(HelloRecord.of(found)))
                     publisher.put(_setup_record(config, found, unix_now_ns(), path.name, dependencies.key))

@@ -31,7 +31,7 @@ _CAUSES = {
 
 
 class ImuUseMonitor(Observer):
-    """Watches the predicted poses, and whether the IMU has contradicted one or two stations."""
+    """Watches the predicted poses of one set-up, and whether the IMU has contradicted one or two stations."""
 
     def __init__(self) -> None:
         self._use = "starting"
@@ -108,7 +108,7 @@ def _contradiction(stations: list[int], now_ns: int) -> EventRecord:
         measured, whose = f"stations {' and '.join(map(str, stations))}", "a tripod or prism"
     message = (
         f"measurements of {measured} contradicted the IMU and went on from elsewhere: {whose} may have moved; "
-        "poses are invalid until the master is restarted. Check the stations first: tsgt calibrate check"
+        "poses are invalid until the master is restarted or takes a new set-up. Check the stations first: tsgt calibrate check"
     )
     station = stations[0] if len(stations) == 1 else None
     return EventRecord(stamp_ns=now_ns, event="station_contradicted", message=message, station=station)

@@ -210,7 +210,7 @@ class PoseRecord(FiniteNumbers):
     reported an error), ``degenerate_geometry`` (prisms collinear or coincident), ``residual`` (the prisms miss their
     layout by too much), ``uncertain`` (all prisms are measured, but the pose is not known well enough), ``tilt`` (the
     robot would lean too far: mirrored layout or swapped prisms), ``contradicted`` (with one or two stations: the IMU has contradicted
-    their measurements, so a tripod or prism may have moved; until the master is restarted). Empty when valid."""
+    their measurements, so a tripod or prism may have moved; until the master is restarted or takes another set-up). Empty when valid."""
     quality: Quality | None = None
     """``good``; ``degraded``: valid, but with less reserve, see ``degraded_by``; ``invalid``: not ``valid``. Null in
     recordings of older versions."""

@@ -130,6 +130,17 @@ def test_few_prisms_confirm_anew_after_a_disagreement(prisms: int) -> None:
     assert monitored.monitor.confirmed
 
 
+def test_lost_imu_is_not_checked() -> None:
+    """Its samples are from before all the measurements that are held."""
+    monitored = Monitored([RIGHT])
+    monitored.run(18)
+    for _ in range(60):
+        now_ns = START + monitored.seconds * SECOND
+        monitored.monitor.measurement(replace(monitored.point, received_ns=now_ns))
+        monitored.seconds += 1
+    assert not monitored.monitor._records
+
+
 @dataclass
 class Setup:
     """A drive as it is configured and as its program gives the samples."""

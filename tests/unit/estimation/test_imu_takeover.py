@@ -365,6 +365,60 @@ def test_quarantine_doubles_with_each_disagreement_in_a_row(
     assert found == pytest.approx(expected, abs=0.11)
 
 
+def test_samples_between_rare_poses_are_all_used() -> None:
+    """Also where poses are ten seconds apart; only before the first measurement old ones are forgotten."""
+    taken: list[InertialSamples] = []
+    driven: list[WheelSamples] = []
+    window = SimpleNamespace(add_samples=taken.append, add_odometry=driven.append)
+    takeover = ImuTakeover(
+        IMU_PARAMETERS, cast("Any", None), lambda: cast("Any", window), odometry=OdometryParameters()
+    )
+    for number in range(60):  # Half seconds
+        if number == 40:
+            takeover.begin(START)
+        record = imu_samples(100 * number, count=100)
+        takeover.add_samples(record)
+        takeover.add_odometry(wheels_beside(record))
+    takeover.take_samples()
+    (samples,), (wheels,) = taken, driven
+    assert 3000 <= len(samples) <= 3100
+    assert 30 <= len(wheels) <= 31
+
+
+def test_silence_does_not_shorten_a_quarantine(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+) -> None:
+    """An IMU that disagreed and then is silent for half a second is used no sooner."""
+    takeover, window, _ = sound
+    uses_of(takeover, 0.0, 1.0)
+    window.health = "stuck"
+    uses_of(takeover, 1.0, 1.1)
+    window.health = None
+    uses_of(takeover, 1.1, 2.0)
+    takeover.choose(2.5)
+    found = uses_of(takeover, 2.5, 10.0)
+    assert [use for use, _ in found] == [ImuUse.SILENT, ImuUse.USED]
+    assert found[0][1] == pytest.approx(1.1 + QUARANTINE_S - 2.5, abs=0.11)
+
+
+def test_unconfirmed_imu_is_not_used_sooner_because_stations_had_none_long_ago(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+) -> None:
+    """The time without a trajectory of the stations counts from when that was lost, also while the IMU was used."""
+    takeover, window, setup = sound
+    setup.confirmed = False
+    uses_of(takeover, 0.0, 1.0)
+    setup.confirmed = True
+    uses_of(takeover, 1.0, 30.0)
+    cast("Any", takeover._without).converged = False
+    window.health, window.setup_in_doubt, window.blow = "a blow", True, True
+    uses_of(takeover, 30.0, 30.1)
+    window.health = None
+    found = uses_of(takeover, 30.1, 50.0)
+    assert [use for use, _ in found] == [ImuUse.DISAGREES, ImuUse.UNCONFIRMED, ImuUse.USED]
+    assert 0.1 + found[0][1] + found[1][1] == pytest.approx(UNAIDED_S, abs=0.21)
+
+
 def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -92,3 +92,46 @@ def test_one_early_sample_is_not_used() -> None:
     assert not clock.add(device_ns[500] + 10**10, int(true_ns[500]))
     found = stamps(clock, true_ns[501:], device_ns[501:], delays_ns[501:])
     assert max(abs(error) for _, error in found) < 300_000
+
+
+@pytest.mark.parametrize("skew", [0.0012, -0.0012, 0.0015, -0.0015, 0.003, -0.003, 0.005, -0.005, 0.03])
+def test_clock_of_a_ceramic_resonator(skew: float) -> None:
+    """A clock off by more than a crystal's has stamps as exact as another."""
+    clock = DeviceClock()
+    errors = [error for _, error in stamps(clock, *regular(6000, skew))]
+    assert len(errors) > 5000
+    assert max(map(abs, errors)) < 2_000_000
+    assert max(map(abs, errors[2000:])) < 50_000
+    assert clock.skew_ppm == pytest.approx(1e6 * skew, abs=5.0)
+    assert clock.steps == 0
+
+
+@pytest.mark.parametrize("skew", [0.0011, -0.0011, 0.0013, 0.002])
+def test_skew_that_the_first_samples_hide(skew: float) -> None:
+    """Ten a second show it late: until then stamps are off by a few milliseconds at most."""
+    true_ns = [START_NS + 20 * i * PERIOD_NS * (1 + skew) for i in range(1200)]
+    device_ns = [777 + 20 * i * PERIOD_NS for i in range(1200)]
+    delays_ns = np.random.default_rng(0).exponential(MS, 1200)
+    errors = [error for _, error in stamps(DeviceClock(), true_ns, device_ns, delays_ns)]
+    assert max(map(abs, errors)) < 8_000_000
+    assert max(map(abs, errors[300:])) < 300_000
+
+
+@pytest.mark.parametrize(("counter", "skew"), [(False, 0.07), (False, -0.07), (True, 0.08)])
+def test_clock_that_is_none_gives_no_times(skew: float, *, counter: bool) -> None:
+    """Rather than wrong ones."""
+    clock = DeviceClock(counter=counter)
+    assert stamps(clock, *regular(6000, skew)) == []
+    assert clock.started
+
+
+def test_stall_after_the_first_samples_shows_no_skew() -> None:
+    """Samples of 6 s arrive at once, or are caught up in the next 6 s: the prior keeps stamps near."""
+    for lateness_ns in (PERIOD_NS * np.arange(1200, 0, -1), 0.5 * PERIOD_NS * np.arange(1200, 0, -1)):
+        true_ns, device_ns, delays_ns = regular(4000, 20e-6)
+        delays_ns[200:1400] += lateness_ns
+        clock = DeviceClock()
+        errors = [error for _, error in stamps(clock, true_ns, device_ns, delays_ns)]
+        assert max(map(abs, errors)) < 8_000_000
+        assert max(map(abs, errors[1500:])) < 100_000
+        assert clock.skew_ppm == pytest.approx(20.0, abs=5.0)

@@ -103,6 +103,18 @@ def test_samples_become_records_and_status() -> None:
     assert bench.events == []
 
 
+def test_device_is_printable() -> None:
+    """Whatever the program says of it: the name goes to terminals."""
+    devices = []
+
+    async def use(bench: Bench) -> None:
+        devices.append(bench.imu.status().device)
+
+    on_bench(use, {**HELLO, "make": "A\x1b[2Jcme"})
+    assert devices[0]
+    assert devices[0].isprintable()
+
+
 def test_ended_program_is_restarted_and_its_loss_reported() -> None:
     """With the reason; recovered with the first sample of the next one."""
 

@@ -142,3 +142,13 @@ def test_device_whose_time_stands_still_is_dropped() -> None:
         times = [7 * 10**9 + n for n in range(number, number + 10)]
         assert push(sampler, number, counter=None, instrument_time_ns=times) == []
     assert sampler.dropped == 2000
+
+
+def test_device_whose_clock_is_none_is_dropped_with_the_reason() -> None:
+    """A tenth too slow is no clock of a device: a wrong time would be worse than none."""
+    sampler = started()
+    for number in range(0, 8000, 10):
+        times = [7 * 10**9 + round(0.9 * n * PERIOD_NS) for n in range(number, number + 10)]
+        assert push(sampler, number, counter=None, instrument_time_ns=times) == []
+    assert sampler.dropped > 1000
+    assert "does not run like that of this computer" in sampler.problem

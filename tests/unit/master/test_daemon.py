@@ -24,6 +24,7 @@ from tsgt.config import AlarmsConfig, GeofenceConfig, ImuConfig
 from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.geofence import run_geofence_command
+from tsgt.master.imu_monitor import ImuUseMonitor
 from tsgt.master.reload import RELOAD_SIGNAL
 from tsgt.master.replay import greeting, replayed
 from tsgt.model import ImuSamples, PolarMeasurement, Status
@@ -298,6 +299,20 @@ async def test_uncalibrated_master_takes_a_calibration_while_it_runs(tmp_path: P
     assert loaded.left_out == sum(m.stamp_ns < applied_ns for m in field.of(PolarMeasurement))
     whole = load_recording(field.recording(), whole=True)
     assert len(whole.measurements) == loaded.left_out + len(loaded.measurements)
+
+
+async def test_use_of_the_imu_is_watched_anew_with_a_new_set_up(tmp_path: Path) -> None:
+    """A contradiction of a station is an event once per set-up, because the estimator begins again."""
+    with patch("tsgt.master.daemon.ImuUseMonitor", side_effect=ImuUseMonitor) as made:
+        async with (
+            field_of(tmp_path, DRIVING) as field,
+            running(field.master(read_setup=lambda: DRIVING.parameters)),
+        ):
+            await asyncio.sleep(2)
+            os.kill(os.getpid(), RELOAD_SIGNAL)
+            await asyncio.sleep(1)
+    assert events(field) == ["setup_applied"]
+    assert made.call_count == 2
 
 
 COLLINEAR = replace(

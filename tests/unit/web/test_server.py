@@ -25,7 +25,6 @@ from tsgt.web import connections, server
 from tsgt.web.access import SECURITY_HEADERS, Access
 
 if TYPE_CHECKING:
-
     import aiohttp
 
 CODE = "correct horse"

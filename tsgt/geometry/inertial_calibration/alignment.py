@@ -40,6 +40,10 @@ MIN_OVERLAP_S = 20.0
 _RATE = slice(9, 12)  # Components of the error of a state
 
 
+class UnrelatedRatesError(GeometryError):
+    """No latency explains the rates: the samples are not the robot's."""
+
+
 @dataclass(frozen=True, slots=True)
 class Alignment:
     """Mounting and latency of an IMU by rates and forces alone: to degrees and hundredths of a second."""
@@ -113,7 +117,11 @@ def align(
     max_latency_s: float = MAX_LATENCY_S,
     min_overlap_s: float = MIN_OVERLAP_S,
 ) -> Alignment:
-    """Find mounting and latency. Raises GeometryError: the robot hardly turns, or no latency explains the rates."""
+    """Find mounting and latency.
+
+    Raises GeometryError: the robot hardly turns, or both have too little in common. Raises UnrelatedRatesError: no latency explains the
+    rates.
+    """
     if not turns(robot):
         raise GeometryError(
             f"the robot hardly turns (rms below {np.degrees(MIN_TURNING_RADPS):.1f} deg/s): drive curves, slopes and bumps"
@@ -123,7 +131,7 @@ def align(
     correlation = float(scores[best])
     turning = _turning(robot)
     if correlation < MIN_CORRELATION * turning / np.hypot(turning, RATE_SIGMA_RADPS):
-        raise GeometryError(
+        raise UnrelatedRatesError(
             f"the angular rates of the IMU are not those of the robot at any latency within {max_latency_s:g} s "
             f"(correlation {correlation:.2f}): another recording's IMU, or damaged samples"
         )

@@ -21,6 +21,7 @@ from tsgt.geometry.inertial.states import TILT_DIM
 from tsgt.geometry.inertial_calibration.alignment import (
     GRID_S,
     MIN_OVERLAP_S,
+    UnrelatedRatesError,
     align,
     nearest_rotation,
     overlap_at,
@@ -163,9 +164,11 @@ def check_imu_setup(
         return SetupCheck(tuple(units))
     try:
         alignment = align(robot, imu, min_overlap_s=min(MIN_OVERLAP_S, MIN_OVERLAP_SHARE * shorter_s))
-    except GeometryError:
+    except UnrelatedRatesError:
         text = "the angular rates of the IMU are not those of the robot at any latency: it is another robot's"
         return SetupCheck((SetupFinding("unrelated", 0.0, 0.0, text),))
+    except GeometryError:  # a robot that turned while the IMU was heard may hardly have turned in all
+        return SetupCheck()
     products = products_at(robot, imu, alignment.latency_s)
     gross = _wrong_axes(products, alignment.rotation, mounting.rotation)
     if gross is not None:

@@ -120,7 +120,7 @@ class MeasurementWindow(ABC):
         try:
             if not self._converged or held is None or not self._update_tracked(held, new):
                 self._initialise(self.observations)
-        except GeometryError:  # not determined, or not yet
+        except (GeometryError, np.linalg.LinAlgError):  # not determined, or not yet
             self._converged = False
             self._discard_trajectory()
             self.residuals_m = np.full((len(self.observations), 3), np.nan)
@@ -134,7 +134,8 @@ class MeasurementWindow(ABC):
         if self._converged:
             try:
                 self._eliminate_before(before_s)
-            except GeometryError:  # by rounding alone; the window suffices to reinitialise
+            except (GeometryError, np.linalg.LinAlgError):
+                # By rounding alone; the window suffices to reinitialise.
                 self._converged = False
         if not self._converged:
             self._horizon_s = max(self._horizon_s, before_s)

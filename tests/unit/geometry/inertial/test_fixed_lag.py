@@ -415,3 +415,27 @@ def test_time_before_the_first_knot() -> None:
     assert states.time_s[0] == first_s - 0.5
     assert (np.diag(covariance[0]) >= 1e4).all()
     assert (np.diag(covariance[1]) < 1.0).all()
+
+
+@pytest.mark.parametrize("step", ["_update_tracked", "_initialise", "_eliminate_before"])
+def test_matrix_that_cannot_be_factorised_loses_the_trajectory(
+    step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And not the program: the next measurements find it again."""
+    live, observations = Live(), measurements()
+    live.measure(observations.select(observations.time_s < 3.0))
+    converged = [live.window.converged]
+
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    with monkeypatch.context() as failing:
+        failing.setattr(live.window, step, fail)
+        if step == "_initialise":
+            failing.setattr(live.window, "_update_tracked", lambda *_: False)
+        first = int(np.searchsorted(observations.time_s, 3.0))
+        live.measure(observations.select(slice(first, first + 1)))
+        converged.append(live.window.converged)
+    live.measure(observations.select((observations.time_s < 6.0) & (np.arange(len(observations)) > first)))
+    converged.append(live.window.converged)
+    assert converged == [True, False, True]

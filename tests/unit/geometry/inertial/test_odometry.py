@@ -255,3 +255,35 @@ def test_live_outage_with_odometry() -> None:
     assert found is not None
     # Of the true speed the measured one is 0.98 times.
     assert abs(found.values[:2].sum() - (1 / 0.98 - 1)) < 3 * found.sigmas[:2].sum()
+
+
+def test_odometry_without_an_imu_is_not_held_for_ever() -> None:
+    """An IMU that is never found leaves wheels that are used for nothing."""
+    window = InertialFixedLagSmoother(
+        imu_parameters(), MotionPrior(), reference_m=np.zeros(3), odometry=PARAMETERS
+    )
+    for now_s in np.arange(1.0, 100.0):
+        end_s = now_s + np.arange(-0.9, 0.01, 0.1)
+        window.add_odometry(WheelSamples(end_s, np.full(10, 0.1), np.ones(10)))
+        window.marginalise_before(now_s - 3.0)
+    assert window._held.odometry is not None
+    assert len(window._held.odometry.samples) < 50
+
+
+def test_lost_trajectory_does_not_hold_samples_for_ever() -> None:
+    """It predicts from its newest knot, but not after minutes without measurements."""
+    imu = imu_parameters()
+    drive = inertial_drive(6.0, seed=12)
+    samples, observations = drive.samples(imu), drive.measure()
+    window = InertialFixedLagSmoother(imu, MotionPrior(), reference_m=np.zeros(3), odometry=PARAMETERS)
+    window.add_samples(samples)
+    window.update(observations)
+    window._converged = False  # As when it does not explain the newest measurements
+    one = samples.select(slice(1))
+    for now_s in np.arange(7.0, 400.0):
+        window.add_samples(replace(one, end_s=np.array([now_s])))
+        window.add_odometry(WheelSamples(np.array([now_s]), np.ones(1), np.ones(1)))
+        window.marginalise_before(now_s - 3.0)
+    assert not window.initialised
+    assert window._held.odometry is not None
+    assert max(len(window._held.imu), len(window._held.odometry.samples)) < 50

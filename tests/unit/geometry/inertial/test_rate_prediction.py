@@ -92,3 +92,22 @@ def test_too_little_learnt_or_a_gap() -> None:
     gap = samples.select(np.delete(np.arange(4000), 3990))
     assert predictor.predict(gap, BIAS, 0.02) is None
     assert predictor.predict(samples.select(slice(30)), BIAS, 0.02) is None
+
+
+@pytest.mark.parametrize("counts", [(0, 0, 0), (-3, -2, 0), (1, -2, 2), (-3, 1, 1)])
+def test_gyro_whose_values_never_change(counts: tuple[int, int, int]) -> None:
+    """Failed to 0, or dead-banded on a standing robot: nothing is learnt, whatever rounding leaves of the mean."""
+    constant = np.radians(np.array(counts) / 16.4)
+    samples = samples_of(np.tile(constant, (4000, 1)))
+    assert learnt(samples, 4000).predict(samples, BIAS, 0.02) is None
+
+
+def test_gyro_whose_values_stop_changing() -> None:
+    """What was learnt before stays, and the angle predicted is that of the constant rate."""
+    rate = np.random.default_rng(2).normal(size=(8000, 3))
+    rate[4000:] = np.radians([1.0, 2.0, 3.0])
+    samples = samples_of(rate)
+    found = learnt(samples, 8000).predict(samples, BIAS, 0.02)
+    assert found is not None
+    assert np.isfinite(found.sigma_rad)
+    np.testing.assert_allclose(found.rate, rate[-1] - BIAS, atol=1e-12)

@@ -239,3 +239,14 @@ def test_rest_of_the_turning_robot_tells_no_unit() -> None:
     samples = right.samples.select(right.samples.end_s > 30.0)
     samples = replace(samples, angular_rate_radps=0.02 * samples.angular_rate_radps)
     assert replace(quiet, samples=samples).check() == SetupCheck()
+
+
+def test_imu_that_was_lost_before_the_robot_stood() -> None:
+    """While both are known the robot turns enough, but not over the whole drive: that says nothing of whose rates they are."""
+    right = drive()
+    time_s, rate = right.trajectory.knots.time_s, right.trajectory.knots.angular_velocity
+    early = time_s < 20.0
+    slow = 0.042 / float(np.sqrt(np.var(rate[early], axis=0).sum()))
+    found = right.turning(np.where(early, slow, 0.0)).sampled(slow * np.eye(3), np.eye(3))
+    samples = found.samples.select(found.samples.end_s < 20.0)
+    assert replace(found, samples=samples).check() == SetupCheck()

@@ -201,14 +201,16 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     def marginalise_before(self, before_s: float) -> None:
         """Marginalise the states before a time; states from then on can still be queried."""
+        tracked = self._converged
         super().marginalise_before(before_s)
-        if self._converged:
+        if tracked and not self._converged:  # It has just been lost, by rounding
+            self._searched = self.observations
+        if self._predictor is not None and before_s - self._predictor.time_s > MAX_OUTAGE_S:
+            self._converged = False
+            self._discard_trajectory()
+        elif self._converged:
             assert self._window is not None  # noqa: S101 (converged)
-            if before_s - self._window.knots.time_s[-1] > MAX_OUTAGE_S:
-                self._converged = False
-                self._discard_trajectory()
-            else:
-                before_s = float(self._window.knots.time_s[0])
+            before_s = float(self._window.knots.time_s[0])
         elif self._searched is not None:
             before_s -= SEARCH_S
             self._searched = self._searched.select(self._searched.time_s >= before_s)

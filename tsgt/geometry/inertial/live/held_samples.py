@@ -67,14 +67,14 @@ class HeldSamples:
 
     def discard_before(self, time_s: float) -> None:
         """Forget what no knot from a time on needs."""
+        if self.odometry is not None:
+            driven = self.odometry.samples
+            self.odometry = replace(self.odometry, samples=driven.select(driven.end_s > time_s - MARGIN_S))
         if not len(self.imu):
             return
         first = int(self.imu.end_s.searchsorted(time_s - MARGIN_S))
         # The last one, however old: missing ones are filled in from there.
         self.imu = self.imu.select(slice(min(first, len(self.imu) - 1), None))
-        if self.odometry is not None:
-            driven = self.odometry.samples
-            self.odometry = replace(self.odometry, samples=driven.select(driven.end_s > time_s - MARGIN_S))
 
     def contiguous(self, knots_s: FloatArray) -> ContiguousSamples:
         """Return the samples of the IMU from the first knot to the last; a knot alone needs some too."""

@@ -27,6 +27,7 @@ SPREAD_S = 0.1
 """Samples whose variance scales that of the prediction: a robot that stops is not shaken any more."""
 REGULARISATION = 1e-4  # On the normal matrix, relative to its mean diagonal
 _MAX_JITTER = 0.5  # Of the time between samples
+_ROUNDING = 1e-14  # Of a mean of rates, relative to them
 
 
 class PredictedRotation(NamedTuple):
@@ -76,6 +77,8 @@ class RotationPredictor:
         """
         if self._coefficients is None or self._learnt_s < MIN_LEARNT_S or len(samples) <= self._order:
             return None
+        if not self._power > 0:  # The rates have not changed within any of the SPREAD_S
+            return None
         if not self._is_contiguous(samples.end_s[-self._order :]):
             return None
         rates = samples.angular_rate_radps[: -self._order - 1 : -1]
@@ -95,6 +98,8 @@ class RotationPredictor:
         # Beyond the horizon the error grows with time.
         growth = max(duration_s / (steps * self._interval_s), 1.0)
         sigma = self._interval_s * np.sqrt(variance / self._power * spread) * growth
+        if not np.isfinite(sigma):
+            return None
         return PredictedRotation(mean - bias + angle / steps, float(sigma))
 
     def _begin(self, interval_s: float) -> None:
@@ -113,6 +118,8 @@ class RotationPredictor:
         before = windows[:, : self._order][:, ::-1]
         mean = before.mean(axis=1, keepdims=True)
         before, after = before - mean, np.cumsum(windows[:, self._order :] - mean, axis=1)
+        if np.abs(before).max() <= _ROUNDING * np.abs(rates).max():
+            return  # A gyro that has failed, or is too coarse to show that the robot stands: it tells nothing
         spread = _spread(before[:, : self._spread_rows()].swapaxes(0, 1))
         decay = float(np.exp(-rows * self._interval_s / MEMORY_S))
         if self._coefficients is not None:

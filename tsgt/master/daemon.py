@@ -65,8 +65,8 @@ if TYPE_CHECKING:
 STATUS_PERIOD_NS = 1_000_000_000
 
 STALL_TIMEOUT_NS = 60_000_000_000
-"""A transaction or frame that lasts longer has stalled; not even a first synchronisation over a bad link does. systemd then
-restarts the master."""
+"""An exchange or frame that lasts longer has stalled: a reply is waited for half as long at most. systemd then restarts the
+master."""
 
 log = structlog.get_logger()
 
@@ -264,7 +264,7 @@ class Link(Protocol):
 
     @property
     def exchange_start_ns(self) -> int | None:
-        """When the present transaction or frame began, on the master's Unix clock; None without a radio."""
+        """When the present exchange or frame began, on the master's Unix clock; None without a radio."""
         ...
 
     def status(self) -> LinkStatus:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class ClassicLink:
-    """Runs transactions and reports results; ``exchange_start_ns``: when the present one began, None without radio."""
+    """Runs transactions and reports results; ``exchange_start_ns``: when the present exchange began, None without radio."""
 
     def __init__(
         self,
@@ -62,11 +62,13 @@ class ClassicLink:
 
     async def run(self, radio: Radio) -> None:
         """Run transactions until the radio raises RadioError."""
-        transport = Transport(radio, self._clock, self._timeline, self._timing)
+        transport = Transport(
+            radio, self._clock, self._timeline, self._timing, on_request=self._exchange_starts
+        )
         try:
             while True:
-                self.exchange_start_ns = self._now_ns()
-                transaction = self._scheduler.next(self.exchange_start_ns)
+                self._exchange_starts()
+                transaction = self._scheduler.next(self._now_ns())
                 if isinstance(transaction, int):
                     await self._clock.sleep_until(self._timeline.monotonic_ns(transaction))
                     continue
@@ -74,6 +76,9 @@ class ClassicLink:
                 self._finished(transaction, transport)
         finally:
             self.exchange_start_ns = None
+
+    def _exchange_starts(self) -> None:
+        self.exchange_start_ns = self._now_ns()
 
     def _now_ns(self) -> int:
         return self._timeline.unix_ns(self._clock.monotonic_ns())

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from tsgt.radio import TX_DONE_NS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tsgt.clock import Clock, UnixTimeline
     from tsgt.radio import Packet, Radio
     from tsgt.radio.classic import LinkTiming, Transaction
@@ -18,7 +20,7 @@ EXACT_SIGMA_NS = 1_000_000
 
 
 class Transport:
-    """Runs transactions over a radio, one at a time.
+    """Runs transactions over a radio, one at a time; ``on_request`` is called before each request.
 
     Attributes
     ----------
@@ -30,11 +32,20 @@ class Transport:
         Packets that were not the expected reply: interference, late replies, damaged packets.
     """
 
-    def __init__(self, radio: Radio, clock: Clock, timeline: UnixTimeline, timing: LinkTiming) -> None:
+    def __init__(
+        self,
+        radio: Radio,
+        clock: Clock,
+        timeline: UnixTimeline,
+        timing: LinkTiming,
+        *,
+        on_request: Callable[[], None] = lambda: None,
+    ) -> None:
         self._radio = radio
         self._clock = clock
         self._timeline = timeline
         self._timing = timing
+        self._on_request = on_request
         self.last: Packet | None = None
         self.requested_ns = 0
         self.unrelated_packets = 0
@@ -42,6 +53,7 @@ class Transport:
     async def run(self, transaction: Transaction) -> None:
         """Run a transaction to its end, or until the radio raises RadioError."""
         while (request := transaction.request()) is not None:
+            self._on_request()
             sent = await self._radio.transmit(request.payload)
             if not request.reply_timeout_ns:
                 continue

@@ -102,6 +102,23 @@ async def test_request_without_reply_does_not_wait() -> None:
     assert took_ns == pytest.approx(2 * TIMING.airtime_ns(2), abs=2 * MS)
 
 
+async def test_each_request_is_told() -> None:
+    """A synchronisation is many of them, and lasts minutes with slow modem settings: progress is counted by request."""
+    async with bench() as both:
+        told_ns: list[int] = []
+        transport = Transport(
+            both.here.radio,
+            both.clock,
+            TIMELINE,
+            TIMING,
+            on_request=lambda: told_ns.append(both.clock.monotonic_ns()),
+        )
+        began_ns = both.clock.monotonic_ns()
+        await transport.run(ScriptedTransaction([Request(b"e1", 250 * MS), Request(b"e2", 250 * MS)]))
+    period_ns = TIMING.airtime_ns(2) + 250 * MS
+    assert [at_ns - began_ns for at_ns in told_ns] == pytest.approx([0, period_ns], abs=2 * MS)
+
+
 async def test_unrelated_packets_are_counted() -> None:
     """Waiting continues."""
     async with bench() as both:

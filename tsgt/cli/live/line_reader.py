@@ -22,7 +22,7 @@ class LineReader:
         self._received = bytearray()
 
     def line(self, until_s: float | None = None) -> bytes:
-        """Return the next line with its newline; at the end of the stream what is left, then nothing.
+        """Return the next line with its newline; at the end of the stream nothing: a line that the end has cut is dropped.
 
         Parameters
         ----------
@@ -45,7 +45,7 @@ class LineReader:
                 self._connection.settimeout(left_s)
             data = self._connection.recv(65536)
             if not data:
-                break
+                return b""
             self._received += data
         line, end, rest = bytes(self._received).partition(b"\n")
         self._received[:] = rest

@@ -80,14 +80,20 @@ def _show_screen(follower: StreamFollower) -> None:
 
 
 def _print_lines(follower: StreamFollower, *, as_json: bool) -> None:
-    """Print a line per status, and on stderr the loss of the connection."""
+    """Print a line per status, and on stderr unreadable lines and the loss of the connection."""
     problem = ""
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             for line in follower.lines(time.monotonic() + TIMEOUT_S):
-                kind = decode(Typed, line).type
-                if kind in ("status", "client_status"):
-                    click.echo(line.rstrip() if as_json else _text_line(kind, line))
+                try:
+                    kind = decode(Typed, line).type
+                    if kind not in ("status", "client_status"):
+                        continue
+                    text = line.rstrip() if as_json else _text_line(kind, line)
+                except ValueError as error:  # of a newer version, for example
+                    click.echo(f"warning: unreadable line: {error}", err=True)
+                else:
+                    click.echo(text)
             if follower.problem not in (problem, ""):
                 click.echo(f"warning: {follower.problem}; connecting again", err=True)
             problem = follower.problem

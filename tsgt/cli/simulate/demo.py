@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from tsgt import service
+from tsgt.cli.config import problems_at_start
 from tsgt.cli.model_options import model_option
 from tsgt.cli.options import RECORDING_SUFFIXES, OutputFile, json_option, path_type
 from tsgt.cli.output import print_json, require_new_file
 from tsgt.cli.simulate.command import protocol_option
 from tsgt.cli.simulate.demo_progress import Progress
 from tsgt.clock import SystemClock, UnixTimeline
-from tsgt.config import ScenarioConfig, SimulatedImu, check_permissions, load
+from tsgt.config import ScenarioConfig, SimulatedImu, check_permissions, find_problems, load
 from tsgt.errors import OutputFileError, StreamError
 from tsgt.estimation import point_label
 from tsgt.log import configure_logging
@@ -152,12 +153,13 @@ def _run(
     """Run a demonstration to its end or to Ctrl-C."""
     clock = SystemClock()
     timeline = UnixTimeline.fixed_now(clock)
-    click.echo(f"poses on     {files.socket}", err=True)
-    click.echo(f"try          {_program()} listen --socket {files.socket}", err=True)
-    click.echo(f"             {_program()} status --socket {files.socket}", err=True)
 
     async def run() -> tuple[Demo, Progress]:
         demo = Demo(scenario, files, duration_s=duration_s, seed=seed, clock=clock)
+        _check_configurations(files)  # complete now: the IMU is added with the demonstration
+        click.echo(f"poses on     {files.socket}", err=True)
+        click.echo(f"try          {_program()} listen --socket {files.socket}", err=True)
+        click.echo(f"             {_program()} status --socket {files.socket}", err=True)
         with (
             Progress(demo, timeline) as progress,
             suppress(asyncio.CancelledError),
@@ -173,6 +175,16 @@ def _run(
         recording=_kept(sorted(files.recordings.glob("*.jsonl")), output),
         reference_point=demo.parameters.reference_point,
     )
+
+
+def _check_configurations(files: DemoFiles) -> None:
+    """Raise ConfigError if a daemon would not start: its log alone would say why, after a minute without poses."""
+    for path in (files.master_config, *map(files.client_config, files.stations)):
+        content, problems = find_problems(path)
+        if content is not None:
+            problems = problems_at_start(path, content)
+        if problems:
+            raise problems[0]
 
 
 def _kept(recordings: list[Path], output: Path | None) -> Path | None:

@@ -88,14 +88,14 @@ class Day:
         await self._morning()
         await self._calibrate()
         await self._apply()
-        drove_s = await self._drive()
+        await self._drive()
         for name, incident in (
             ("prism", self._hidden_prism),
             ("battery", self._empty_battery),
             ("tripod", self._moved_tripod),
         ):
             if name in incidents:
-                drove_s = await incident(drove_s)
+                await incident()
 
     async def _morning(self) -> None:
         await self._step(
@@ -145,7 +145,7 @@ class Day:
             script=lambda: self._run_all(("calibrate", "targets", file, "--apply", "master.toml")),
         )
 
-    async def _drive(self) -> float:
+    async def _drive(self) -> None:
         self.site.start_driving()
         began_s = self.site.now_s()
         self.site.drain_battery(EMPTY)
@@ -158,10 +158,9 @@ class Day:
             ),
             script=lambda: self._run_all(("status",), accepted={0, 3}),
         )
-        return began_s
+        self._end_part("drive", began_s)
 
-    async def _hidden_prism(self, drove_s: float) -> float:
-        self._end_part("drive", drove_s)
+    async def _hidden_prism(self) -> None:
         self.site.hide_prism(HIDDEN)
         incident = self._begin(f"line of sight of station {HIDDEN} blocked")
         await self._step(
@@ -172,9 +171,8 @@ class Day:
             script=lambda: self._when_noticed(incident, f"clear {HIDDEN}"),
             watch=lambda: self._notice_silence(incident, HIDDEN),
         )
-        return self.site.now_s()
 
-    async def _empty_battery(self, _drove_s: float) -> float:
+    async def _empty_battery(self) -> None:
         self.site.switch_off(EMPTY)
         incident = self._begin(f"battery of station {EMPTY} empty")
         await self._step(
@@ -186,9 +184,8 @@ class Day:
             script=lambda: self._when_noticed(incident, f"battery {EMPTY}"),
             watch=lambda: self._notice_silence(incident, EMPTY),
         )
-        return self.site.now_s()
 
-    async def _moved_tripod(self, _drove_s: float) -> float:
+    async def _moved_tripod(self) -> None:
         self.site.move_tripod()
         incident = self._begin(f"tripod of station {MOVED} moved by 144 mm")
 
@@ -227,7 +224,6 @@ class Day:
             ),
         )
         self._end_part("after the second calibration", began_s)
-        return began_s
 
     # --- Parts and incidents -----------------------------------------------------------------------------------
 

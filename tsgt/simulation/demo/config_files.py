@@ -140,8 +140,9 @@ def _master(files: DemoFiles, scenario: ScenarioConfig, protocol: Protocol, law:
         f"noise = {{ {_inline(station.noise.model_dump())} }}\n"
         for station in scenario.stations
     )
-    limits = scenario.pipeline.model_dump(mode="json")
-    motion = limits.pop("motion")
+    # A default that is written out counts as stated: a short lag drops default delays, but rejects stated ones.
+    limits = scenario.pipeline.model_dump(mode="json", exclude_unset=True)
+    motion = limits.pop("motion", {})
     pipeline = "\n".join(f"{key} = {json.dumps(value)}" for key, value in limits.items())
     classic = f"{_CLASSIC}initial_cycles = {DEMO_SYNC_CYCLES}      # the paper's 50 take half a minute\n"
     return f"""\

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 import pytest
 from harness.files.records import IMU_STATUS, ODOMETRY_STATUS
+from harness.files.stream_lines import serving
 
 from tsgt.cli.live.status_text import client_text, duration, master_text, station_label
 from tsgt.model import Status
@@ -482,3 +483,37 @@ def test_drain_of_a_backlog_is_shown(
     plain = [entry.rstrip() for block in text for entry in block.splitlines()]
     shown = [entry for entry in plain if "shrink" in entry]
     assert [entry.strip() for entry in shown] == ([line.strip()] if line else [])
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_watch_goes_on_after_unreadable_lines(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, as_json: bool
+) -> None:
+    """Each is a warning; a line that the end of the connection has cut is dropped."""
+
+    def interrupt(_delay_s: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tsgt.cli.live.follower.time.sleep", interrupt)  # Ctrl-C when it would connect again
+    line = encode_line(MASTER)
+    with serving(tmp_path / "s", b"".join([b'["noise"]\n', line, b"\n", line[:60]])):
+        outcome = tsgt("status", "--watch", "--socket", tmp_path / "s", *(["--json"] if as_json else []))
+    assert outcome.code == 0
+    assert len(outcome.out.splitlines()) == 1
+    assert outcome.err.startswith("warning: unreadable line: ")
+    assert len(outcome.err.splitlines()) == 1
+
+
+def test_watch_warns_of_a_status_that_it_cannot_read(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one of a newer version."""
+
+    def interrupt(_delay_s: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tsgt.cli.live.follower.time.sleep", interrupt)
+    with serving(tmp_path / "s", b'{"type":"status"}\n{"type":"client_status"}\n'):
+        outcome = tsgt("status", "--watch", "--socket", tmp_path / "s")
+    assert outcome.code == 0
+    assert outcome.err.count("warning: unreadable line: ") == 2

@@ -1,4 +1,4 @@
-"""Memory of the demonstration's progress."""
+"""Memory of the demonstration's progress, and scenarios whose daemons cannot start."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from tsgt.analysis.evaluation import PoseErrors, pose_errors
 from tsgt.cli.simulate.demo_progress import Progress
 from tsgt.clock import SystemClock, UnixTimeline
 from tsgt.config import ScenarioConfig
+from tsgt.errors import StreamError
 from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion, transform_from
 from tsgt.recording import StatusRecord, encode_line
 from tsgt.simulation.demo import Demo, write_demo_files
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from harness.files.cli import Tsgt
     from numpy.typing import NDArray
 
 PERIOD_NS = 50_000_000
@@ -95,3 +97,64 @@ def _lines(poses: NDArray[np.float64], start_ns: int) -> Iterator[bytes]:
         yield encode_line(replace(POSE, stamp_ns=stamp_ns, kind="smoothed", **fields))
         if index == POSES // 5 - 1:
             yield encode_line(StatusRecord(stamp_ns=stamp_ns, poses=index, valid_poses=index, stations=()))
+
+
+STATION = "[[stations]]\nstation = {0}\nprism = {1}\nposition_m = [{0}, 0, 0]\n"
+PRISM = "[[prisms]]\nprism = {0}\nposition_m = [{1}, {2}, 1]\n"
+
+
+def _scenario(folder: Path, *stations: tuple[int, int]) -> Path:
+    """Write a scenario with stations, each on a prism, and return its path."""
+    prisms = [PRISM.format(prism, index, index**2) for index, (_, prism) in enumerate(stations)]
+    entries = [STATION.format(*each) for each in stations]
+    path = folder / "scenario.toml"
+    path.write_text("\n".join(['kind = "scenario"', *entries, *prisms]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("stations", "arguments", "reason"),
+    [
+        (
+            ((1, 1), (2, 2), (10, 3)),
+            ("--protocol", "classic"),
+            "station 10 with prism 3: the protocol classic",
+        ),
+        (
+            ((1, 1), (2, 2), (3, 10)),
+            ("--protocol", "classic"),
+            "station 3 with prism 10: the protocol classic",
+        ),
+        (((1, 1), (2, 2), (3, 17)), (), "station 3 with prism 17: the protocol superframe"),
+        (((1, 1), (2, 2)), (), "2 stations on 2 prisms cannot give poses without an IMU"),
+    ],
+)
+def test_scenario_whose_daemons_cannot_start_is_an_error(
+    tsgt: Tsgt,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    stations: tuple[tuple[int, int], ...],
+    arguments: tuple[str, ...],
+    reason: str,
+) -> None:
+    """One line before any process starts, not a minute without poses."""
+    monkeypatch.setattr(Demo, "run", _starts)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    result = tsgt("demo", "--scenario", _scenario(tmp_path, *stations), *arguments)
+    assert result.code == 2
+    assert reason in result.err
+    assert len(result.err.splitlines()) == 1
+    assert result.out == ""
+
+
+def test_two_stations_and_an_imu_start(tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The master has the IMU when its configuration is checked."""
+    monkeypatch.setattr(Demo, "run", _starts)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    scenario = _scenario(tmp_path, (1, 1), (2, 2))
+    result = tsgt("demo", "--scenario", scenario, "--duration", 1, "--imu", "industrial")
+    assert "the daemons start" in result.err
+
+
+async def _starts(_demo: Demo, _on_line: Callable[[bytes], None]) -> None:
+    raise StreamError("the daemons start")

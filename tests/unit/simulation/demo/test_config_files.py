@@ -15,6 +15,7 @@ from tsgt.config import (
     ClientConfig,
     LeicaInstrumentConfig,
     MasterConfig,
+    PipelineConfig,
     ReferencePointConfig,
     ScenarioConfig,
     SimulatedImu,
@@ -43,6 +44,19 @@ def test_master_setup_equals_the_scenario(tmp_path: Path) -> None:
     scenario = ScenarioConfig(reference_point=lidar)
     files = write_demo_files(tmp_path, scenario, tmp_path / "poses.sock")
     assert parameters(load(files.master_config, MasterConfig)) == scenario_parameters(scenario)
+
+
+@pytest.mark.parametrize(
+    "pipeline",
+    [PipelineConfig(lag_s=0.5), PipelineConfig(lag_s=2.0, smoothed_delays_s=(0.5, 1.5), estimator="linear")],
+)
+def test_master_has_the_pipeline_of_the_scenario(tmp_path: Path, pipeline: PipelineConfig) -> None:
+    """What the scenario leaves to its default stays one: a short lag drops default delays, but rejects stated ones."""
+    scenario = ScenarioConfig(pipeline=pipeline)
+    files = write_demo_files(tmp_path, scenario, tmp_path / "poses.sock")
+    config = load(files.master_config, MasterConfig)
+    assert config.pipeline == pipeline
+    assert parameters(config) == scenario_parameters(scenario)
 
 
 async def test_master_has_the_imu_of_the_robot(tmp_path: Path) -> None:

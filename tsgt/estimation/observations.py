@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
+from tsgt.estimation.tracks import MAX_TIME_SIGMA_S, has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import corrected_angles, corrected_distance, polar_to_cartesian
 from tsgt.geometry.trajectory import Observations
 from tsgt.model import PointMeasurement, PolarMeasurement
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 INSTRUMENT_TIME_SIGMA_S = 6e-4
 FIRST_TIME_SIGMA_S = 3e-3
-MAX_TIME_SIGMA_S = 100.0
 FIRST_TIMES = 5
 """Sigma of the conversion from an instrument's clock to its station's, which no stamp includes: steady state, with
 timestamps in whole ms, and first measurements, from where it falls with the square root of their number. The conversion

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     from tsgt.model import Measurement, Parameters, StationParameters
 
+MAX_TIME_SIGMA_S = 100.0
+
 
 @dataclass(frozen=True, slots=True)
 class Track:
@@ -142,7 +144,9 @@ def _track_of(station: StationParameters, measurements: Sequence[Measurement]) -
 
 
 def _time_sigma_ns(measurement: PolarMeasurement, station: StationParameters) -> int:
-    return round(math.hypot(measurement.stamp_sigma_ns, 1e9 * station.time_sigma_s))
+    # Beyond the limit a measurement has no weight; its square would overflow.
+    stamp_sigma_ns = min(measurement.stamp_sigma_ns, 1e9 * MAX_TIME_SIGMA_S)
+    return round(math.hypot(stamp_sigma_ns, 1e9 * station.time_sigma_s))
 
 
 def _from_polar(

@@ -53,7 +53,11 @@ def squared_misfit(
         covariance += world_part @ prism_covariances[:, prism] @ world_part.swapaxes(1, 2)
         common += world_part @ common_errors[:, prism]
     covariance += common @ np.ascontiguousarray(common.swapaxes(1, 2))
-    squared = residual.swapaxes(1, 2) @ np.linalg.solve(covariance, residual)
+    try:
+        weighted = np.linalg.solve(covariance, residual)
+    except np.linalg.LinAlgError:  # without noise, where it says nothing
+        weighted = np.linalg.pinv(covariance, hermitian=True) @ residual
+    squared = residual.swapaxes(1, 2) @ weighted
     return squared[:, 0, 0], freedom
 
 

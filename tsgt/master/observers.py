@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, Parameters
     from tsgt.recording import EventRecord
 
+SILENCE_NS = 5_000_000_000
+"""Poses are computed when a measurement arrives, but after such a silence without one: those of hours would block the master."""
+
 
 def layout_monitor(config: FrameWatchConfig, parameters: Parameters) -> Observer:
     """Return the layout monitor, with the poses that it can judge."""
@@ -50,10 +53,25 @@ class _LinearPoses(Observer):
         self._observer = observer
         pipeline = replace(parameters.pipeline, estimator="linear")
         self._estimator = LiveEstimator(replace(parameters, pipeline=pipeline))
+        self._advanced_ns: int | None = None
 
     def measurement(self, record: Measurement) -> Sequence[EventRecord]:
-        poses = (found for found in self._estimator.measurement(record) if isinstance(found, PoseRecord))
-        return [event for pose in poses for event in self._observer.pose(pose, record.received_ns)]
+        self._advanced_ns = record.received_ns
+        return self._events(self._estimator.measurement(record), record.received_ns)
+
+    def tick(self, now_ns: int) -> Sequence[EventRecord]:
+        deadline_ns = self.next_deadline_ns()
+        if deadline_ns is None or now_ns < deadline_ns:
+            return ()
+        self._advanced_ns = now_ns
+        return self._events(self._estimator.advance(now_ns), now_ns)
+
+    def next_deadline_ns(self) -> int | None:
+        return None if self._advanced_ns is None else self._advanced_ns + SILENCE_NS
+
+    def _events(self, records: Sequence[object], now_ns: int) -> Sequence[EventRecord]:
+        poses = (record for record in records if isinstance(record, PoseRecord))
+        return [event for pose in poses for event in self._observer.pose(pose, now_ns)]
 
 
 class GeofenceObserver(Observer):

@@ -12,7 +12,7 @@ from harness.drives.scene import LAYOUT, SECOND, START, at_rest, driving, statio
 from tsgt.errors import DegenerateGeometryError
 from tsgt.estimation import LinearEstimator, PoseBatch, Reason
 from tsgt.geometry import exp_so3, log_so3, rotation_from_quaternion
-from tsgt.model import TRACKING_NOISE, PrismPosition, Status
+from tsgt.model import TRACKING_NOISE, InstrumentNoise, PrismPosition, Status
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -331,3 +331,20 @@ def test_lower_station_counts_at_equal_instants(scene: Scene) -> None:
     ahead, behind = (poses_of(two, order, until_s=3.0) for order in (measurements, measurements[::-1]))
     np.testing.assert_array_equal(ahead.position_m, behind.position_m)
     assert ahead.station[4, 0] == 1
+
+
+@pytest.mark.parametrize("stamp_sigma_ns", [10**17, 2**63 - 1])
+def test_time_that_is_unknown_breaks_nothing(scene: Scene, stamp_sigma_ns: int) -> None:
+    """A damaged recording may state any sigma."""
+    measurements = every(scene.moving(driving), [0.4 * number for number in range(8)])
+    measurements[10] = replace(measurements[10], stamp_sigma_ns=stamp_sigma_ns)
+    assert poses_of(scene, measurements, until_s=4.0).valid.any()
+
+
+def test_measurements_without_any_noise_break_nothing(scene: Scene) -> None:
+    """As a configuration may state them; at whole epochs their covariance is singular."""
+    exact = InstrumentNoise(range_sigma_m=0.0, range_sigma_ppm=0.0, angle_sigma_rad=0.0, pointing_sigma_m=0.0)
+    stations = tuple(replace(station, noise=exact) for station in scene.parameters.stations)
+    noiseless = replace(scene, parameters=replace(scene.parameters, stations=stations))
+    measurements = every(noiseless, [0.0, 0.4, 0.8])
+    assert len(poses_of(noiseless, measurements, until_s=2.0).valid) > 0

@@ -25,6 +25,8 @@ _SERIES_BELOW = 2.0  # Correlation times; below, the series of _TERMS terms is e
 _TERMS = 32
 _POWERS = np.arange(_TERMS, dtype=np.float64)
 
+_MAX_FOUND = 16  # An epoch asks for a few sets of times, each more than once
+
 _SCALE_POWERS = np.array([2.0, 1.0, 0.0])
 _EYE = np.eye(STATE_DIM)
 
@@ -85,6 +87,8 @@ class Propagator:
         """
         key = tuple(time_s.tolist())
         if key not in self._found:
+            if len(self._found) >= _MAX_FOUND:  # without measurements, one start serves for hours
+                self._found.clear()
             self._found[key] = self._propagate(time_s)
         return self._found[key]
 

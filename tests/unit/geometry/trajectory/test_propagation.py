@@ -54,3 +54,11 @@ def test_process_noise_scale_acts_on_the_variance() -> None:
     _, found = Propagator(state, covariance, PRIOR, process_noise_scale=2.0).at(7.6)
     _, expected = Propagator(state, covariance, doubled_prior).at(7.6)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
+
+
+def test_memory_does_not_grow_with_time() -> None:
+    """Without measurements, the poses of hours are predicted from one state."""
+    propagator = Propagator(*rotating(0.3), PRIOR)
+    for step in range(100):
+        propagator.at(7.0 + 0.05 * step)
+    assert len(propagator._found) <= 16

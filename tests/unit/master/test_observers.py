@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import pytest
 from harness.drives.scene import SECOND, driving, stationary_scene
 
 from tsgt.config import FrameWatchConfig
@@ -13,6 +12,8 @@ from tsgt.master.layout_monitor import LayoutMonitor
 from tsgt.master.observers import layout_monitor
 
 if TYPE_CHECKING:
+    import pytest
+
     from tsgt.recording import EventRecord, PoseRecord
 
 SCENE = stationary_scene().moving(driving).with_limits(estimator="continuous")

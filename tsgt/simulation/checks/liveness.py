@@ -15,7 +15,7 @@ from tsgt.simulation.faults import FaultKind
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from tsgt.simulation.mission import JournalIndex, MasterLog, MissionResult
+    from tsgt.simulation.mission import JournalIndex, MasterLog, MissionResult, StationLog
 
 RECOVERY_TIME_S = 10.0
 """Rates are measured from this time after the last fault."""
@@ -38,6 +38,9 @@ age of the newest measurement.
 
 MAX_MISFIT_M = 0.002
 """No poses are expected if stations that have moved distort the prisms' triangle by more: the measurements contradict each other."""
+
+CONTRADICTION_S = 5.0
+"""How long measurements contradict the IMU at most before the master says so."""
 
 
 def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]) -> Iterator[str]:
@@ -78,7 +81,7 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
         protocol,
         stations=len(result.parameters.stations),
         knocked=FaultKind.IMU_KNOCK in result.faults,
-        contradicted=_contradicted_by_late_stamps(master_log, indices),
+        contradicted=_contradicted_by_station(result, master_log, indices),
     )
     expected = seconds * 1e9 / result.parameters.pipeline.period_ns
     misfit_m = apparent_poses(result, master_log, np.arange(from_s, to_s)).misfit_m
@@ -94,16 +97,32 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
 def pose_share(protocol: str, *, stations: int, knocked: bool, contradicted: bool) -> float:
     """Minimum share of valid poses.
 
-    An IMU that was knocked is set up wrongly for good. Fewer than three stations have no poses without it. A station with late stamps
-    contradicts the IMU as one that has moved: ``contradicted``, also for good.
+    An IMU that was knocked is set up wrongly for good. Fewer than three stations have no poses without it. A station with late stamps,
+    or on another prism, contradicts the IMU as one that has moved: ``contradicted``, also for good.
     """
     return 0.0 if (knocked or contradicted) and stations < MIN_PRISMS else MIN_VALID_SHARE[protocol]
 
 
-def _contradicted_by_late_stamps(master_log: MasterLog, indices: Mapping[int, JournalIndex]) -> bool:
-    """Whether measurements were said to contradict the IMU while a station's stamps were late."""
+def _contradicted_by_station(
+    result: MissionResult, master_log: MasterLog, indices: Mapping[int, JournalIndex]
+) -> bool:
+    """Whether measurements were said to contradict the IMU while a station's stamps were late, or it followed another prism."""
+    prisms = {station.station: station.prism for station in result.parameters.stations}
+    for event in master_log.events:
+        if event.event != "station_contradicted":
+            continue
+        at_s = (event.stamp_ns - master_log.unix_at_zero_ns) / 1e9
+        others = (
+            follows_another(index.station_log, prisms[number], at_s) for number, index in indices.items()
+        )
+        if stamps_are_late(indices.values(), at_s) or any(others):
+            return True
+    return False
+
+
+def follows_another(station_log: StationLog, prism: int, at_s: float) -> bool:
+    """Whether a station has measured another prism than its own in the seconds before a true time."""
     return any(
-        stamps_are_late(indices.values(), (event.stamp_ns - master_log.unix_at_zero_ns) / 1e9)
-        for event in master_log.events
-        if event.event == "station_contradicted"
+        at_s - CONTRADICTION_S <= each.true_ns / 1e9 <= at_s and each.prism not in (None, prism)
+        for each in station_log.reported_distances
     )

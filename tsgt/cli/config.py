@@ -112,12 +112,12 @@ def problems_at_start(file: Path, content: Model, *, key_owner: int | None = Non
         case MasterConfig():
             before = len(problems)
             missing = missing_setup_files(content)
-            for path in (content.setup.station_frames, content.setup.prism_layout):
+            for path in content.setup_files:
                 if path in missing:
                     continue
                 problems += find_problems(path)[1]
                 attempt(check_permissions, path)
-            if len(problems) == before and not missing:
+            if len(problems) == before:
                 attempt(_check_master, file, content)
         case ScenarioConfig():
             prisms = scenario_parameters(content).prisms
@@ -138,7 +138,8 @@ def _check_master(file: Path, config: MasterConfig) -> None:
         if error.path is None:
             raise ConfigError(f"{file}: {error}", path=file, key=error.key) from error
         raise
-    _check_layout(config.setup.prism_layout, known.prisms, imu=known.imu is not None)
+    if known.no_poses is None:  # the layout exists
+        _check_layout(config.setup.prism_layout, known.prisms, imu=known.imu is not None)
 
 
 def _check_layout(path: Path, prisms: tuple[PrismPosition, ...], *, imu: bool) -> None:

@@ -74,8 +74,8 @@ def master(config_path: Path) -> None:
     config = load(config_path, MasterConfig)
 
     def read_setup() -> Parameters:
-        check_permissions(config.setup.station_frames)
-        check_permissions(config.setup.prism_layout)
+        for path in config.setup_files:
+            check_permissions(path)
         return parameters_in_force(config)
 
     in_force = read_setup()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,8 @@ from tsgt.model import MAX_COORDINATE_M, MAX_NUMBER, Matrix4
 
 # A calibration writes 17 digits; a matrix copied from a report has about seven.
 RIGID_TOLERANCE = 1e-6
+
+MAX_SOCKET_PATH_BYTES = 107  # As in tsgt.service, a layer above
 
 Number = Annotated[int, Field(ge=1, le=MAX_NUMBER)]
 NumberKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,8}$")]
@@ -22,10 +25,23 @@ Place = tuple[Coordinate, Coordinate, Coordinate]
 
 def relative_to_file(path: Path, info: ValidationInfo) -> Path:
     """Return a path of a configuration; a relative one counts from the file's folder."""
+    if "\0" in str(path):
+        raise ValueError("a path cannot contain a zero byte")
     return Path((info.context or {}).get("folder", "")) / path
 
 
+def _short_enough(path: Path, info: ValidationInfo) -> Path:
+    """Reject the path of a socket that cannot be opened; of a file only, as simulated sockets are not opened."""
+    size = len(os.fsencode(path))
+    if info.context and size > MAX_SOCKET_PATH_BYTES:
+        raise ValueError(
+            f"the path of a UNIX socket has at most {MAX_SOCKET_PATH_BYTES} bytes, not {size}: {path}"
+        )
+    return path
+
+
 RelativePath = Annotated[Path, AfterValidator(relative_to_file)]
+SocketPath = Annotated[RelativePath, AfterValidator(_short_enough)]
 
 
 def rigid(T: Matrix4) -> Matrix4:

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from tsgt.config.base import Model, Positive, RelativePath, relative_to_file
+from tsgt.config.base import Model, Positive, RelativePath, SocketPath, relative_to_file
 from tsgt.config.radio import ProtocolConfig, RadioConfig, check_numbers
 
 Baud = Literal[2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600]
@@ -160,7 +160,7 @@ class ClientConfig(Model):
     """Radio protocol; as the master's."""
     journal: JournalConfig = JournalConfig()
     """Journal on disk."""
-    status_socket: RelativePath = Path("/run/tsgt/client.sock")
+    status_socket: SocketPath = Path("/run/tsgt/client.sock")
     """UNIX socket for `tsgt status`."""
 
     @model_validator(mode="after")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
+import stat
 import tomllib
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
@@ -32,7 +34,7 @@ Config = Annotated[
     Field(discriminator="kind"),
 ]
 
-_MAX_BYTES = 4_000_000  # Bounds what is read of a device or another large file
+_MAX_BYTES = 4_000_000  # Bounds what is read of a large file
 
 # All kinds of files, by the value of their top-level key ``kind``.
 KINDS: dict[str, type[Model]] = {
@@ -92,7 +94,9 @@ def json_schema(kind: str | None = None) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=_open_without_waiting) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{path}: is a device or pipe, not a file; name a configuration", path=path)
             content = file.read(_MAX_BYTES + 1)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file", path=path) from None
@@ -103,11 +107,19 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path}: larger than {_MAX_BYTES // 1_000_000} MB; name a configuration", path=path
         )
     try:
-        return tomllib.loads(content.decode("utf-8"))
+        raw = tomllib.loads(content.decode("utf-8"))
+        # Validation and messages need it; fails for huge hexadecimal numbers and long dotted keys.
+        json.dumps(raw, default=str)
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not UTF-8 text (byte {error.start})", path=path) from error
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:  # huge numbers, deep nesting
         raise ConfigError(f"{path}: not TOML: {error}", path=path) from error
+    return raw
+
+
+def _open_without_waiting(name: str, flags: int) -> int:
+    """Open a file; a pipe does not block until somebody writes it."""
+    return os.open(name, flags | os.O_NONBLOCK)
 
 
 def _kind(path: Path, raw: dict[str, Any]) -> str:
@@ -151,6 +163,8 @@ def _explained(problem: ErrorDetails, key: str, model: type[Model]) -> str:
             return f"{key}: unknown key; {hint}"
         case "missing":
             return f"{key}: missing key"
+        case "json_invalid":  # tables that are nested too deeply
+            return f"cannot be read: {problem['ctx']['error']}"
         case "union_tag_not_found":
             return f"{key}.kind: missing key"
         case "union_tag_invalid":

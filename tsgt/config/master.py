@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.alarms import AlarmsConfig
-from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, unique_by
+from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, SocketPath, unique_by
 from tsgt.config.imu import ImuConfig
 from tsgt.config.odometry import OdometryConfig
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
@@ -50,7 +50,7 @@ class StationConfig(Model):
 class StreamConfig(Model):
     """Socket of the pose stream."""
 
-    socket: RelativePath = Path("/run/tsgt/poses.sock")
+    socket: SocketPath = Path("/run/tsgt/poses.sock")
     """UNIX socket of the pose stream."""
     mode: Annotated[str, Field(pattern=r"^0[0-7]{3}$")] = "0660"
     """Permissions of the socket, octal as for chmod."""
@@ -140,6 +140,16 @@ class MasterConfig(Model):
     """Pose stream."""
     recording: RecordingConfig = RecordingConfig()
     """Recording on disk."""
+
+    @property
+    def setup_files(self) -> tuple[Path, ...]:
+        """Files that the poses depend on: of kind ``station_frames``, ``prism_layout`` and, if given, ``imu_mounting``."""
+        mounting = None if self.imu is None else self.imu.mounting
+        return (
+            self.setup.station_frames,
+            self.setup.prism_layout,
+            *(() if mounting is None else (mounting,)),
+        )
 
     @model_validator(mode="after")
     def _odometry_has_an_imu(self) -> MasterConfig:

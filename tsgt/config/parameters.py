@@ -215,6 +215,8 @@ def _simulated_imu(config: SimulatedImu) -> ImuParameters | None:
 
 def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
     """Convert the configuration of the pipeline."""
+    lag_ns = round(pipeline.lag_s * 1e9)
+    delays_ns = sorted(round(delay_s * 1e9) for delay_s in pipeline.smoothed_delays_s)
     return PipelineParameters(
         estimator=pipeline.estimator,
         period_ns=round(1e9 / pipeline.rate_hz),
@@ -231,11 +233,9 @@ def pipeline_parameters(pipeline: PipelineConfig) -> PipelineParameters:
             angular_acceleration_correlation_time_s=pipeline.motion.angular_acceleration_correlation_time_s,
         ),
         noise_scale=pipeline.noise_scale,
-        lag_ns=round(pipeline.lag_s * 1e9),
+        lag_ns=lag_ns,
         # A lag that is shorter than the default delay leaves nothing to smooth before it.
-        smoothed_delays_ns=tuple(
-            round(delay_s * 1e9) for delay_s in sorted(pipeline.smoothed_delays_s) if delay_s < pipeline.lag_s
-        ),
+        smoothed_delays_ns=tuple(delay_ns for delay_ns in delays_ns if delay_ns < lag_ns),
         position_sigma_limit_m=pipeline.position_sigma_limit_mm / 1e3,
         rotation_sigma_limit_rad=math.radians(pipeline.rotation_sigma_limit_deg),
         predicted_position_sigma_limit_m=pipeline.predicted_position_sigma_limit_mm / 1e3,

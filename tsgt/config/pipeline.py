@@ -12,7 +12,7 @@ from tsgt.model import ROBOT_FRAME, ReferencePoint, Row4
 # The limits of the estimator, see MotionPrior.
 Acceleration = Annotated[float, Field(ge=1e-6, le=1e6)]
 PerAxis = tuple[Acceleration, Acceleration, Acceleration]
-Delay = Annotated[float, Field(gt=0, le=60)]
+Delay = Annotated[float, Field(ge=1e-3, le=60)]
 Lasting = Annotated[float, Field(ge=1e-3, le=1e4)]
 
 MAX_DELAYS = 4  # each costs as much as the predictions
@@ -70,9 +70,11 @@ class PipelineConfig(Model):
     @model_validator(mode="after")
     def _delays_are_below_the_lag(self) -> PipelineConfig:
         delays_s = self.smoothed_delays_s
-        if len(set(delays_s)) < len(delays_s):
+        delays_ns = [round(delay_s * 1e9) for delay_s in delays_s]
+        if len(set(delays_ns)) < len(delays_ns):
             raise ValueError("smoothed_delays_s: each delay must be given once")
-        if "smoothed_delays_s" in self.model_fields_set and max(delays_s, default=0.0) >= self.lag_s:
+        lag_ns = round(self.lag_s * 1e9)
+        if "smoothed_delays_s" in self.model_fields_set and max(delays_ns, default=-1) >= lag_ns:
             raise ValueError(
                 f"smoothed_delays_s: {max(delays_s):g} is not below lag_s ({self.lag_s:g}), after which poses are final"
             )

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from tsgt.config.base import Model, Positive, RelativePath
+from tsgt.config.base import Model, RelativePath
 
 Pin = Annotated[int, Field(ge=0, le=1000)]
 
@@ -100,13 +100,15 @@ class ClassicConfig(Model):
 class ClassicMasterConfig(ClassicConfig):
     """Settings of the master for the protocol classic."""
 
-    reply_timeout_ms: Positive = 250.0
+    reply_timeout_ms: Annotated[float, Field(gt=0, le=30_000)] = (
+        250.0  # a longer exchange would count as stalled
+    )
     """Reply timeout, in addition to the time on air of a long reply."""
     initial_cycles: Annotated[int, Field(ge=1, le=1000)] = 50
     """Exchanges of the first synchronisation of each station."""
     resync_cycles: Annotated[int, Field(ge=1, le=1000)] = 5
     """Exchanges of each later synchronisation."""
-    resync_interval_s: Positive = 300.0
+    resync_interval_s: Annotated[float, Field(ge=1, le=1e6)] = 300.0
     """Interval between synchronisations of a station; stations are staggered."""
     clock_filter: Literal["regression", "paper"] = "regression"
     """Clock filter: `regression` estimates offset and skew, `paper` is the paper's low-pass with w = 0.1."""

@@ -22,18 +22,24 @@ if TYPE_CHECKING:
 def lora_settings(config: ModemConfig, path: Path) -> LoRaSettings:
     """Return the modem settings of section ``[radio]`` in the file ``path``.
 
-    Raises ConfigError if the chip has no such bandwidth, the region has no such channel, or 20 dBm are not allowed.
+    Raises ConfigError if the chip has no such bandwidth, the region has no such channel and there is no licence, or
+    20 dBm are not allowed.
     """
     frequency_hz, bandwidth_hz = round(config.frequency_mhz * 1e6), round(config.bandwidth_khz * 1e3)
     try:
         power_dbm = MIN_POWER_DBM if config.power_dbm is None else config.power_dbm
         if config.region is not None:
-            preset = preset_power_dbm(
-                config.region,
-                frequency_hz=frequency_hz,
-                bandwidth_hz=bandwidth_hz,
-                antenna_gain_dbi=config.antenna_gain_dbi,
-            )
+            try:
+                preset = preset_power_dbm(
+                    config.region,
+                    frequency_hz=frequency_hz,
+                    bandwidth_hz=bandwidth_hz,
+                    antenna_gain_dbi=config.antenna_gain_dbi,
+                )
+            except RadioSettingsError:
+                if config.licence is None:
+                    raise
+                preset = MIN_POWER_DBM  # the licence's limit is unknown
             power_dbm = preset if config.power_dbm is None else config.power_dbm
         if power_dbm == 20 and not config.allow_20_dbm:
             raise RadioSettingsError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,23 @@ def examples(tsgt: Tsgt, tmp_path: Path) -> Path:  # noqa: F811 (a fixture)
         shutil.copy(path, tmp_path)
     assert tsgt("radio", "key", tmp_path / "radio.key").code == 0
     return tmp_path
+
+
+MOUNTING = """kind = "imu_mounting"
+position_m = [0.21, -0.12, 0.43]
+orientation_xyzw = [0.0, 0.0, 0.0, 1.0]
+latency_ms = 0.0
+gyro_matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+"""
+
+
+def master_with_imu(folder: Path) -> Path:
+    """Return the example of two stations, changed so that the file imu.toml has the mounting."""
+    path = folder / "master.two-stations.example.toml"
+    mounting = {"position_m": 'mounting = "imu.toml"', "orientation_xyzw": "", "latency_ms": ""}
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(mounting.get(line.partition(" ")[0], line) for line in lines))
+    return path
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
@@ -122,11 +140,68 @@ def test_check_needs_the_key(tsgt: Tsgt, examples: Path, kind: str) -> None:  # 
     assert "key " not in tsgt("config", "check", examples / f"{kind}.classic.example.toml").out
 
 
-def test_check_rejects_world_writable_files(tsgt: Tsgt, examples: Path) -> None:  # noqa: F811 (a fixture)
+@pytest.mark.parametrize("name", ["prism_layout.example.toml", "imu.toml"])
+def test_check_rejects_world_writable_files(tsgt: Tsgt, examples: Path, name: str) -> None:  # noqa: F811 (a fixture)
     """The daemon would not start with them."""
-    (examples / "prism_layout.example.toml").chmod(0o666)
-    outcome = tsgt("config", "check", examples / "master.example.toml")
+    master = master_with_imu(examples)
+    (examples / "imu.toml").write_text(MOUNTING)
+    assert tsgt("config", "check", master).code == 0
+    (examples / name).chmod(0o666)
+    outcome = tsgt("config", "check", master)
     assert (outcome.code, outcome.err.count("chmod o-w")) == (2, 1)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+@pytest.mark.parametrize(
+    ("mounting", "problem"),
+    [
+        (None, "no such file"),
+        (
+            MOUNTING.replace("latency_ms = 0.0", "latency_ms = true"),
+            "latency_ms = true: should be a valid number",
+        ),
+        ('kind = "prism_layout"\n[prisms.1]\nposition_m = [1, 0, 0]\n', 'kind "imu_mounting" is expected'),
+    ],
+    ids=["missing", "invalid", "another kind"],
+)
+def test_check_needs_the_mounting_of_the_imu(
+    tsgt: Tsgt,  # noqa: F811 (a fixture)
+    examples: Path,
+    mounting: str | None,
+    problem: str,
+    calibrated: bool,  # noqa: FBT001 (a parameter)
+) -> None:
+    """Also before the first calibration; the reports of other files are not lost."""
+    master, layout = master_with_imu(examples), examples / "prism_layout.example.toml"
+    if mounting is not None:
+        (examples / "imu.toml").write_text(mounting)
+    if not calibrated:
+        (examples / "station_frames.example.toml").unlink()
+    outcome = tsgt("config", "check", layout, master, "--json")
+    assert outcome.code == 2
+    accepted, rejected = outcome.json()["files"]
+    assert (accepted["ok"], len(rejected["errors"])) == (True, 1)
+    assert rejected["errors"][0].startswith(f"{examples / 'imu.toml'}: ")
+    assert problem in rejected["errors"][0]
+
+
+def test_check_rejects_what_is_no_file(tsgt: Tsgt, tmp_path: Path) -> None:  # noqa: F811 (a fixture)
+    """A pipe that nobody writes would block for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    outcome = tsgt("config", "check", tmp_path / "pipe")
+    assert (outcome.code, outcome.err) == (
+        2,
+        f"error: {tmp_path / 'pipe'}: is a device or pipe, not a file; name a configuration\n",
+    )
+
+
+def test_check_accepts_a_licence_outside_of_the_bands(tsgt: Tsgt, examples: Path) -> None:  # noqa: F811 (a fixture)
+    """The bands of the region do not apply with it."""
+    master = examples / "master.example.toml"
+    text = master.read_text()
+    master.write_text(text.replace("frequency_mhz = 905.0", 'frequency_mhz = 433.92\nlicence = "VE2XYZ"'))
+    outcome = tsgt("config", "check", master)
+    assert (outcome.code, outcome.err) == (0, "")
 
 
 def test_check_accepts_a_master_before_its_calibration(tsgt: Tsgt, examples: Path) -> None:  # noqa: F811 (a fixture)

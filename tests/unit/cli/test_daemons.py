@@ -16,6 +16,21 @@ if TYPE_CHECKING:
 
     from click import Command
 
+IMU = """
+[imu]
+command = ["/bin/imu"]
+mounting = "imu.toml"
+latitude_deg = 46.8
+"""
+
+MOUNTING = """
+kind = "imu_mounting"
+position_m = [0.2, -0.1, 0.4]
+orientation_xyzw = [0.0, 0.0, 0.0, 1.0]
+latency_ms = 0.0
+gyro_matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+"""
+
 
 @pytest.mark.parametrize(
     ("daemon", "file"),
@@ -24,11 +39,14 @@ if TYPE_CHECKING:
         ("master", "master.toml"),
         ("master", "frames.toml"),
         ("master", "layout.toml"),
+        ("master", "imu.toml"),
     ],
 )
 def test_daemon_rejects_world_writable_files(tmp_path: Path, daemon: str, file: str) -> None:
     """A configuration can run any program, and set-up files move every pose."""
-    FakeMachine(tmp_path)
+    fake = FakeMachine(tmp_path)
+    fake.change("master.toml", "[stream]", IMU + "[stream]")
+    fake.write("imu.toml", MOUNTING)
     (tmp_path / file).chmod(0o666)
     command = {"client": client, "master": master}[daemon]
     refused = CliRunner().invoke(command, ["--config", str(tmp_path / f"{daemon}.toml")]).exception

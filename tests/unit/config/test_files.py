@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,7 @@ from tsgt.config import (
     load_station_calibration,
 )
 from tsgt.errors import ConfigError
+from tsgt.service import MAX_SOCKET_PATH_BYTES
 
 EXAMPLES = Path(__file__).parents[3] / "configs"
 MASTER = (EXAMPLES / "master.example.toml").read_text()
@@ -39,6 +42,10 @@ PROBLEMS = {
     "number out of range": (
         ("rate_hz = 20.0", "rate_hz = -1"),
         "pipeline.rate_hz = -1: should be greater than or equal to 0.01",
+    ),
+    "delay below a nanosecond": (
+        ("smoothed_delays_s = [1.0]", "smoothed_delays_s = [1e-10]"),
+        "pipeline.smoothed_delays_s[#1] = 1e-10: should be greater than or equal to 0.001",
     ),
     "not a number": (
         ("rate_hz = 20.0", "rate_hz = nan"),
@@ -125,10 +132,19 @@ def test_error_has_the_key_as_data(tmp_path: Path) -> None:
     assert error.value.key == "pipeline.outage_limit_s"
 
 
-def test_endless_file() -> None:
-    """A device in place of a file is not read to its end."""
-    with pytest.raises(ConfigError, match="/dev/zero: larger than 4 MB; name a configuration"):
-        load(Path("/dev/zero"), MasterConfig)
+def test_endless_file(tmp_path: Path) -> None:
+    """Neither a device nor a large file in place of a configuration is read to its end, and a pipe does not block."""
+    os.mkfifo(tmp_path / "pipe")
+    for path in (Path("/dev/zero"), tmp_path / "pipe"):
+        with pytest.raises(
+            ConfigError, match=f"{path}: is a device or pipe, not a file; name a configuration"
+        ):
+            load(path, MasterConfig)
+    large = tmp_path / "large"
+    with large.open("wb") as file:
+        file.truncate(10_000_000_000)
+    with pytest.raises(ConfigError, match="large: larger than 4 MB; name a configuration"):
+        load(large, MasterConfig)
 
 
 def test_missing_file(tmp_path: Path) -> None:
@@ -151,13 +167,26 @@ def test_binary_file(tmp_path: Path) -> None:
         load(path, MasterConfig)
 
 
-@pytest.mark.parametrize("text", ["x = " + 5000 * "[", "x = " + 5000 * "9", "x = " + 5000 * "{a="])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = " + 5000 * "[",
+        "x = " + 5000 * "9",
+        "x = " + 5000 * "{a=",
+        "x = 0x" + 5000 * "f",
+        "kind = 0x" + 5000 * "f",
+        "kind" + 20_000 * ".a" + " = 1",
+        'kind = "client"\nx' + 300 * ".a" + " = 1",
+    ],
+    ids=range(7),
+)
 def test_deep_nesting_and_huge_numbers(text: str, tmp_path: Path) -> None:
     """They are configuration errors."""
     path = tmp_path / "a.toml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=r"a\.toml: not TOML: "):
+    with pytest.raises(ConfigError, match=r"a\.toml: (not TOML|cannot be read): ") as error:
         load_any(path)
+    assert len(str(error.value)) < len(str(path)) + 200
 
 
 def test_file_of_another_kind(tmp_path: Path) -> None:
@@ -188,6 +217,32 @@ def test_unprintable_key_is_escaped(key: str, tmp_path: Path) -> None:
     assert message.isprintable()
     assert len(message) < len(str(path)) + 200
     assert "unknown key" in message
+
+
+@pytest.mark.parametrize("key", ["socket", "directory"])
+def test_path_with_a_zero_byte_is_rejected(key: str, tmp_path: Path) -> None:
+    """Opening it would raise ValueError."""
+    path = tmp_path / "master.toml"
+    path.write_text(re.sub(rf"(?m)^{key} = .*$", rf'{key} = "a\\u0000b"', MASTER))
+    with pytest.raises(ConfigError, match=rf"{key}: a path cannot contain a zero byte$"):
+        load(path, MasterConfig)
+
+
+@pytest.mark.parametrize("kind", ["master", "client"])
+def test_path_of_a_socket_is_limited(kind: str, tmp_path: Path) -> None:
+    """To what the kernel takes, counted in bytes."""
+    path = tmp_path / f"{kind}.toml"
+    text = (EXAMPLES / f"{kind}.example.toml").read_text()
+    default = "/run/tsgt/poses.sock" if kind == "master" else "/run/tsgt/client.sock"
+    assert default in text
+    longest = "/run/" + (MAX_SOCKET_PATH_BYTES - 5) * "x"
+    path.write_text(text.replace(default, longest))
+    load_any(path)
+    path.write_text(text.replace(default, longest[:-1] + "é"))
+    with pytest.raises(
+        ConfigError, match=r"socket: the path of a UNIX socket has at most 107 bytes, not 108: /run/x+é$"
+    ):
+        load_any(path)
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tsgt.config import (
+    ClassicMasterConfig,
     MasterConfig,
     NoiseConfig,
     PipelineConfig,
@@ -137,6 +138,21 @@ def test_delays_are_below_the_lag() -> None:
         PipelineConfig(lag_s=0.8, smoothed_delays_s=(0.5, 1.0))
     with pytest.raises(ValueError, match="each delay must be given once"):
         PipelineConfig(smoothed_delays_s=(0.5, 0.5))
+
+
+def test_delays_differ_by_nanoseconds() -> None:
+    """What the pipeline computes with; smaller differences are none."""
+    assert pipeline_parameters(PipelineConfig(lag_s=1.0000000001)).smoothed_delays_ns == ()
+    with pytest.raises(ValueError, match=r"smoothed_delays_s: 0.5 is not below lag_s"):
+        PipelineConfig(lag_s=0.5000000001, smoothed_delays_s=(0.5,))
+    with pytest.raises(ValueError, match="each delay must be given once"):
+        PipelineConfig(smoothed_delays_s=(0.5, 0.5000000001))
+
+
+def test_resynchronisation_takes_a_second_at_least() -> None:
+    """The protocol classic divides by the interval."""
+    with pytest.raises(ValueError, match=r"resync_interval_s\n.*greater than or equal to 1"):
+        ClassicMasterConfig(kind="classic", resync_interval_s=1e-10)
 
 
 def test_reference_point_of_the_imu_is_its_frame(folder: Path) -> None:

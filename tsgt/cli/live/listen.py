@@ -85,7 +85,7 @@ class _Instant(click.ParamType[int]):
 @click.option(
     "--rate",
     "rate_hz",
-    type=FiniteRange(min=0.001),
+    type=FiniteRange(0.001, 1000.0),
     help="Maximum number of poses per second of each series (predicted, smoothed at each delay, final), by their stamps.",
 )
 @click.option(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ import click
 from tsgt.cli.setup.options import answer
 from tsgt.config import MasterConfig, load
 from tsgt.errors import ConfigError
+from tsgt.radio.superframe.wire import KEY_BYTES
 from tsgt.setup import KEY, MASTER, Mission, MissionError, decode_mission, encode_mission, hand_over_lines
 
 if TYPE_CHECKING:
@@ -34,10 +36,10 @@ def mission_key(system: System) -> bytes:
         raise ConfigError(
             f"{KEY} is missing, or only root may read it: sudo tsgt setup mission", path=system.path(KEY)
         )
-    try:
-        return bytes.fromhex(text.strip())
-    except ValueError:
-        raise ConfigError(f"{KEY}: not a key", path=system.path(KEY)) from None
+    digits = text.strip()
+    if re.fullmatch(rf"[0-9A-Fa-f]{{{2 * KEY_BYTES}}}", digits) is None:
+        raise ConfigError(f"{KEY}: not a key", path=system.path(KEY))
+    return bytes.fromhex(digits)
 
 
 def mission_of(radio: ModemConfig, key: bytes) -> Mission:

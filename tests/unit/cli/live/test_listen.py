@@ -138,6 +138,7 @@ def test_lines_are_selected(tsgt: Tsgt, tmp_path: Path) -> None:
         ("--kind", "poses", "unknown kind 'poses'; known: pose, smoothed"),
         ("--since", "yesterday", "is neither a time such as"),
         ("--rate", "0", "--rate"),
+        ("--rate", "1e10", "--rate"),
     ],
 )
 def test_wrong_selection_is_a_usage_error(

@@ -244,6 +244,16 @@ def test_key_of_another_mission_stays(tsgt: Tsgt, pi: PiToSetUp) -> None:
     assert (pi.root / "etc/tsgt/radio.key").read_text() == KEY.hex() + "\n"
 
 
+@pytest.mark.parametrize("text", ["abcd", KEY.hex() + "00", "no key", ""])
+def test_mission_needs_a_whole_key(tsgt: Tsgt, pi: PiToSetUp, text: str) -> None:
+    """As the daemons do."""
+    assert tsgt(*MASTER).code == 0
+    (pi.root / "etc/tsgt/radio.key").write_text(text + "\n")
+    shown = tsgt("setup", "mission")
+    assert shown.code in (1, 2)
+    assert "radio.key: not a key" in shown.err
+
+
 def test_edited_configuration_stays_and_differences_are_shown(tsgt: Tsgt, pi: PiToSetUp) -> None:
     """Unless it is asked for; then the old one is kept beside it."""
     tsgt(*STATION)

@@ -19,10 +19,12 @@ from structlog.testing import capture_logs
 from unit.station.test_control_socket import START_NS, WARM, talk
 
 from tsgt.config import BridgeInstrumentConfig, TcpAddress
+from tsgt.model import Status
 from tsgt.radio import Packet
 from tsgt.recording import read_lines
 from tsgt.recording.journal import load_journal
 from tsgt.simulation.instrument import SimulatedNetwork
+from tsgt.simulation.instrument.total_station import BOOT_NS
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
 from tsgt.station import ClientDependencies, run_client
 from tsgt.station.bridge import BridgeInstrument
@@ -202,3 +204,24 @@ async def test_fit_of_the_instrument_clock_is_dropped(suspended_s: float) -> Non
         assert reading.instrument_time_ns is not None
         late_ns = reading.at_ns - clock.local_ns(truth[reading.instrument_time_ns // 1_000_000])
         assert abs(late_ns) < 2 * reading.sigma_ns
+
+
+async def test_instrument_that_was_switched_off_meanwhile_measures_at_once() -> None:
+    """Its clock begins again, below the last distance: that is no repetition."""
+    async with leica_bench() as bench:
+
+        async def measure_after_boot(readings: int) -> int:
+            bench.station.switch_off()
+            bench.station.switch_on()
+            await asyncio.sleep(BOOT_NS / 1e9)
+            await bench.instrument.connect()
+            await bench.instrument.track(1)
+            await bench.read_until(Status.OK, within_s=12.0)
+            for _ in range(readings):
+                await bench.instrument.read()
+            await bench.instrument.close()
+            return bench.station.reported_distances[-1].instrument_ms
+
+        last_ms = await measure_after_boot(100)
+        bench.instrument.host_clock_restarted()
+        assert await measure_after_boot(0) < last_ms

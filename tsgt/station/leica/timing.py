@@ -69,6 +69,9 @@ class DistanceTimestamper:
         self._clock_fit: InstrumentClock | ExchangeClock = InstrumentClock()
         self.problem = ""
         self._last_ms: int | None = None
+        self._before_restart_ms: int | None = (
+            None  # the last distance reported before a restart of the host's clock
+        )
         self._log_limiter = LogLimiter()
         self._requested_ns = self._received_ns = 0
         self._exchange_ns = _EXCHANGE_NS
@@ -79,11 +82,16 @@ class DistanceTimestamper:
     def reset(self, *, over_network: bool) -> None:
         """Start over with another instrument."""
         self.over_network = over_network
-        self._last_ms = None
         self.host_clock_restarted()
+        self._before_restart_ms = None
 
     def host_clock_restarted(self) -> None:
-        """Start over with the host's clock; a distance that has been reported is still not new."""
+        """Start over with the host's clock; the distance that was reported last is still not new.
+
+        Nothing else is known of the instrument's clock: it may have been switched off and on meanwhile.
+        """
+        if self._last_ms is not None:
+            self._before_restart_ms, self._last_ms = self._last_ms, None
         self._clock_fit = ExchangeClock() if self.over_network else InstrumentClock()
         self._waiting_since_ns = None
         self.problem = ""
@@ -145,7 +153,9 @@ class DistanceTimestamper:
 
     def is_new(self, time_ms: int) -> bool:
         """Whether a distance with this time has not been reported before."""
-        return self._last_ms is None or not 0 <= self._last_ms - time_ms < _REPEAT_WINDOW_MS
+        if self._last_ms is None:
+            return time_ms != self._before_restart_ms
+        return not 0 <= self._last_ms - time_ms < _REPEAT_WINDOW_MS
 
     def mark_reported(self, time_ms: int) -> None:
         """Mark the distance with this time as reported."""

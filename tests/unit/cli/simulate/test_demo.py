@@ -112,6 +112,7 @@ def _scenario(folder: Path, *stations: tuple[int, int]) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("short_temporary_folder")
 @pytest.mark.parametrize(
     ("stations", "arguments", "reason"),
     [
@@ -139,7 +140,6 @@ def test_scenario_whose_daemons_cannot_start_is_an_error(
 ) -> None:
     """One line before any process starts, not a minute without poses."""
     monkeypatch.setattr(Demo, "run", _starts)
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     result = tsgt("demo", "--scenario", _scenario(tmp_path, *stations), *arguments)
     assert result.code == 2
     assert reason in result.err
@@ -147,10 +147,10 @@ def test_scenario_whose_daemons_cannot_start_is_an_error(
     assert result.out == ""
 
 
+@pytest.mark.usefixtures("short_temporary_folder")
 def test_two_stations_and_an_imu_start(tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The master has the IMU when its configuration is checked."""
     monkeypatch.setattr(Demo, "run", _starts)
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     scenario = _scenario(tmp_path, (1, 1), (2, 2))
     result = tsgt("demo", "--scenario", scenario, "--duration", 1, "--imu", "industrial")
     assert "the daemons start" in result.err

@@ -17,7 +17,6 @@ from tsgt.cli.simulate.rehearse import INCIDENTS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
-    from pathlib import Path
 
     from harness.files.cli import Tsgt
 
@@ -74,14 +73,14 @@ async def _step(_day: Day, *_text: str, watch: Callable[[], None] = lambda: None
     watch()
 
 
+@pytest.mark.usefixtures("short_temporary_folder")
 @pytest.mark.parametrize("incident", INCIDENTS)
 @pytest.mark.parametrize(("drive", "code"), [(GOOD, 0), (NO_POSE, 3)])
 def test_first_drive_is_judged_whatever_goes_wrong_later(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, incident: str, drive: Accuracy, code: int
+    tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch, incident: str, drive: Accuracy, code: int
 ) -> None:
     """Exit code 3 if its poses were wrong, or if there was none."""
     watch = _Watch([drive, GOOD, GOOD])
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr("tsgt.cli.simulate.rehearse.Site", _Site)
     monkeypatch.setattr("tsgt.cli.simulate.rehearse.Watch", lambda *_arguments: watch)
     monkeypatch.setattr(Day, "_step", _step)

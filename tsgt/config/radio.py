@@ -100,9 +100,8 @@ class ClassicConfig(Model):
 class ClassicMasterConfig(ClassicConfig):
     """Settings of the master for the protocol classic."""
 
-    reply_timeout_ms: Annotated[float, Field(gt=0, le=30_000)] = (
-        250.0  # a longer exchange would count as stalled
-    )
+    # A longer exchange would count as stalled.
+    reply_timeout_ms: Annotated[float, Field(gt=0, le=30_000)] = 250.0
     """Reply timeout, in addition to the time on air of a long reply."""
     initial_cycles: Annotated[int, Field(ge=1, le=1000)] = 50
     """Exchanges of the first synchronisation of each station."""

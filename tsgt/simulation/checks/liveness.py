@@ -40,7 +40,7 @@ MAX_MISFIT_M = 0.002
 """No poses are expected if stations that have moved distort the prisms' triangle by more: the measurements contradict each other."""
 
 CONTRADICTION_S = 5.0
-"""How long measurements contradict the IMU at most before the master says so."""
+"""Measurements of this time before the event are looked at for its cause."""
 
 
 def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]) -> Iterator[str]:

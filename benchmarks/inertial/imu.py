@@ -26,9 +26,8 @@ import numpy as np
 
 from tsgt.config import SuperframeMasterConfig
 from tsgt.errors import GeometryError
-from tsgt.estimation.inertial import inertial_samples
+from tsgt.estimation.inertial import inertial_samples, wheel_samples
 from tsgt.estimation.observations import build_observations, centroid_m
-from tsgt.estimation.odometry import wheel_samples
 from tsgt.geometry import log_so3, quaternion_from_rotation
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.inertial import Mounting, fit_inertial_trajectory

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from harness.inertial.imu_faults import Drive, confirm_once
 
-from tsgt.estimation import imu_setup_monitor
+from tsgt.estimation.inertial import setup_monitor as imu_setup_monitor
 from tsgt.log import configure_logging
 
 START_S = 10.0

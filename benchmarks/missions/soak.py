@@ -37,7 +37,7 @@ from harness.missions.passed_on import PassedOn
 from measuring import normalised_squared
 
 from tsgt.config import ClassicMasterConfig, SuperframeMasterConfig
-from tsgt.estimation import imu_setup_monitor
+from tsgt.estimation.inertial import setup_monitor as imu_setup_monitor
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.log import configure_logging
 from tsgt.simulation.checks import check_invariants

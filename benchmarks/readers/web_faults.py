@@ -29,7 +29,7 @@ from harness.readers.browser import CHROMIUM, browser
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
 from tsgt.simulation.demo import Demo, DemoFiles, write_demo_files
-from tsgt.web.stations import MAX_AGE_S
+from tsgt.web.mission.stations import MAX_AGE_S
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator

@@ -31,13 +31,20 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from tsgt.analysis.compare import Estimate, FitSettings, ReferencePoses, Relation, nested_fits, pair
-from tsgt.analysis.compare.drifting_frame import NAMES, Unknowns, linearise, rows_of, solve, start_states
+from tsgt.analysis.compare.alignment.drifting_frame import (
+    NAMES,
+    Unknowns,
+    linearise,
+    rows_of,
+    solve,
+    start_states,
+)
+from tsgt.analysis.compare.alignment.frame import FRAME_NAMES
+from tsgt.analysis.compare.alignment.reference_error import as_white, own_covariance, whiten
+from tsgt.analysis.compare.alignment.uncertainty import WEAK_SIGMA
 from tsgt.analysis.compare.errors import nees
-from tsgt.analysis.compare.fit_uncertainty import WEAK_SIGMA
-from tsgt.analysis.compare.frame_alignment import FRAME_NAMES
 from tsgt.analysis.compare.interpolation import ReferenceTrajectory
 from tsgt.analysis.compare.pairing import on_reference_clock
-from tsgt.analysis.compare.reference_error import as_white, own_covariance, whiten
 from tsgt.analysis.compare.relative import relative
 from tsgt.analysis.formats.trajectories import read_reference_poses
 from tsgt.geometry import (

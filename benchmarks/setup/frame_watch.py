@@ -23,7 +23,7 @@ from measuring import simulated
 from tsgt.config import ClassicMasterConfig, FrameWatchConfig, ScenarioConfig
 from tsgt.estimation import LiveEstimator
 from tsgt.geometry import exp_so3, transform_from
-from tsgt.master.layout_monitor import LayoutMonitor
+from tsgt.master.monitors.layout import LayoutMonitor
 from tsgt.recording import PoseRecord, load_recording
 from tsgt.simulation.options import SimulationOptions
 from tsgt.simulation.rehearsal import SCENARIO

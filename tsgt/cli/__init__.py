@@ -1,8 +1,8 @@
 """The command line: thin commands over the other rooms, and the only place that imports click.
 
 In come arguments and files, out go results on stdout, logs on stderr and an exit code. ``main`` holds the table of
-commands and ``daemons`` the entry points of the daemons; the sub-rooms ``analyse``, ``calibrate``, ``desk``, ``radio``
-and ``simulate`` hold groups of commands, and ``options``, ``model_options``, ``output`` and ``progress`` what they share.
+commands and ``daemons`` the entry points of the daemons; the sub-rooms hold groups of commands, and ``options``,
+``model_options``, ``output`` and ``progress`` what they share.
 """
 
 import os

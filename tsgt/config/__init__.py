@@ -36,7 +36,6 @@ from tsgt.config.files import (
     load,
     load_any,
 )
-from tsgt.config.imu import IMU_NOISE, ImuConfig, ImuNoiseConfig, normal_gravity_mps2
 from tsgt.config.master import (
     FrameWatchConfig,
     GeofenceConfig,
@@ -46,7 +45,6 @@ from tsgt.config.master import (
     StationConfig,
     StreamConfig,
 )
-from tsgt.config.odometry import OdometryConfig
 from tsgt.config.parameters import (
     level_frame,
     missing_setup_files,
@@ -72,14 +70,18 @@ from tsgt.config.radio import (
     WiringConfig,
 )
 from tsgt.config.scenario import (
+    ImuModelName,
+    ImuSetupErrorConfig,
     InstrumentModelConfig,
     MotionConfig,
     OcclusionConfig,
     ScenarioConfig,
     ScenarioRadioConfig,
+    ShakingConfig,
+    SimulatedImu,
     SimulatedStation,
 )
-from tsgt.config.scenario_imu import ImuModelName, ImuSetupErrorConfig, ShakingConfig, SimulatedImu
+from tsgt.config.sensors import IMU_NOISE, ImuConfig, ImuNoiseConfig, OdometryConfig, normal_gravity_mps2
 from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, SensorMountingFile, StationFramesFile
 
 __all__ = [

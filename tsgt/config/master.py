@@ -9,10 +9,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.alarms import AlarmsConfig
 from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, SocketPath, unique_by
-from tsgt.config.imu import ImuConfig
-from tsgt.config.odometry import OdometryConfig
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import MasterProtocolConfig, RadioConfig, check_numbers
+from tsgt.config.sensors import ImuConfig, OdometryConfig
 from tsgt.polygon import check_simple
 
 NoiseFactor = Annotated[float, Field(ge=0.001, le=1000)]

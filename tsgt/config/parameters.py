@@ -12,7 +12,7 @@ from tsgt.config.calibration import (
     load_station_calibration,
     setup_covariance,
 )
-from tsgt.config.imu import IMU_NOISE
+from tsgt.config.sensors import IMU_NOISE
 from tsgt.errors import ConfigError
 from tsgt.model import (
     ARCSECOND_RAD,
@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from tsgt.config.base import NoiseConfig
     from tsgt.config.master import MasterConfig, StationConfig
     from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
-    from tsgt.config.scenario import ScenarioConfig, SimulatedStation
-    from tsgt.config.scenario_imu import SimulatedImu
+    from tsgt.config.scenario import ScenarioConfig, SimulatedImu, SimulatedStation
     from tsgt.model import ReferencePoint, SetupCovariance
 
 

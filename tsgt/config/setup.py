@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.base import Model, NotNegative, Number, NumberKey, Place, rigid
-from tsgt.config.imu import ImuNoiseConfig
+from tsgt.config.sensors import ImuNoiseConfig
 from tsgt.model import Matrix4, Row4, SetupCovariance, Vector3
 
 InstrumentErrorMrad = Annotated[float, Field(ge=-100, le=100)]

@@ -1,19 +1,25 @@
 """Measurements to poses, live and from a recording. Sans-I/O; knows neither radio nor files.
 
 In: raw measurements and the parameters in force. Out: poses with covariance, validity and reason, as records or arrays.
-`linear` and `continuous` are the estimators, `live` puts measurements and poses in the order of the stream; `tracks`,
-`observations` and `inertial` apply latency, constants, frames and noise; `pose_batch` and `pose_output` hold and validate poses;
-`reference_point` carries them to another point of the robot.
+`linear` and `continuous` are the estimators, `live` puts measurements and poses in the order of the stream; `tracks` and
+`observations` apply latency, constants, frames and noise, `inertial` takes the robot's IMU and wheels; `pose_batch` and `pose_output`
+hold and validate poses; `reference_point` carries them to another point of the robot.
 """
 
-from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, StartCheck, check_recorded_setup, start_now
-from tsgt.estimation.imu_takeover import OdometryState
-from tsgt.estimation.inertial import SampleConverter, inertial_samples
+from tsgt.estimation.inertial import (
+    ImuSetupMonitor,
+    OdometryState,
+    SampleConverter,
+    StartCheck,
+    check_recorded_setup,
+    inertial_samples,
+    start_now,
+    wheel_samples,
+)
 from tsgt.estimation.linear import LinearEstimator
 from tsgt.estimation.live import LiveEstimator
 from tsgt.estimation.noise_scales import noise_scales, with_noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m, instrument_time_sigma_s
-from tsgt.estimation.odometry import wheel_samples
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
 from tsgt.estimation.pose_quality import sigma_limits_of

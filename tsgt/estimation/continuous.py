@@ -4,7 +4,7 @@ Each epoch (the whole multiples of a period in Unix time) gets a pose *predicted
 before, and a lag later one *smoothed* by the measurements on both sides. Smoothed poses are computed in groups, with the
 first prediction of each half second, which is cheaper. At each of the configured delays below the lag there is one more,
 smoothed by the measurements that have arrived by the first epoch at which the delay has passed. With an IMU the predictions
-integrate its samples from the newest measurement on; :mod:`~tsgt.estimation.imu_takeover` says when it is used. The poses depend only on the order of the calls, not on when the
+integrate its samples from the newest measurement on; :mod:`~tsgt.estimation.inertial.takeover` says when it is used. The poses depend only on the order of the calls, not on when the
 estimator is asked: a replay gives the same poses bit for bit.
 """
 
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.imu_takeover import UNCONFIRMED_SIGMAS, ImuTakeover
+from tsgt.estimation.inertial.takeover import UNCONFIRMED_SIGMAS, ImuTakeover
 from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
@@ -35,8 +35,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor
-    from tsgt.estimation.imu_takeover import ImuState, TrajectoryWindow
+    from tsgt.estimation.inertial import ImuSetupMonitor, ImuState, TrajectoryWindow
     from tsgt.estimation.pose_output import PoseNumbers
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import States

@@ -10,14 +10,13 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from tsgt.estimation.continuous import ContinuousEstimator
-from tsgt.estimation.imu_setup_monitor import ImuSetupMonitor, start_now
+from tsgt.estimation.inertial import ImuSetupMonitor, start_now
 from tsgt.estimation.linear import LinearEstimator
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from tsgt.estimation.imu_setup_monitor import StartCheck
-    from tsgt.estimation.imu_takeover import ImuState
+    from tsgt.estimation.inertial import ImuState, StartCheck
     from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
     from tsgt.recording import EventRecord, PoseRecord
 

@@ -13,7 +13,7 @@ import numpy as np
 from tsgt.geometry.trajectory import concatenate_states
 
 if TYPE_CHECKING:
-    from tsgt.estimation.imu_takeover import QueriedTrajectory
+    from tsgt.estimation.inertial import QueriedTrajectory
     from tsgt.estimation.pose_output import ContinuousPoseOutput, PoseNumbers
     from tsgt.geometry import FloatArray
     from tsgt.geometry.trajectory import FixedLagSmoother, Predictions, States

@@ -23,9 +23,8 @@ from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError, StreamE
 from tsgt.imu import Imu, WheelOdometry
 from tsgt.master.alarms import Alarms
 from tsgt.master.classic import ClassicLink
-from tsgt.master.imu_monitor import ImuUseMonitor, OdometryUseMonitor
 from tsgt.master.link_events import MasterEvent
-from tsgt.master.observers import GeofenceObserver, layout_monitor
+from tsgt.master.monitors import GeofenceObserver, ImuUseMonitor, OdometryUseMonitor, layout_monitor
 from tsgt.master.publisher import Observer, Publisher
 from tsgt.master.reacquisition_hints import ReacquisitionHints
 from tsgt.master.recording_thread import RecordingDisk, RecordingThread, disk_status

@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from tsgt.errors import RecordingError
-from tsgt.master.disk_monitor import DiskMonitor
+from tsgt.master.monitors import DiskMonitor
 from tsgt.recording import DiskStatus, RecordingStatus
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Mapping
 
     from tsgt.clock import Clock
-    from tsgt.web.state import MissionState
+    from tsgt.web.mission import MissionState
 
 INTERVAL_S = 0.2
 

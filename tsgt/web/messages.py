@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tsgt.web.state import Cursors, MissionState
+    from tsgt.web.mission.state import Cursors, MissionState
 
 
 def message(

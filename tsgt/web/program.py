@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from tsgt.service import notify_systemd
 from tsgt.web.live import LiveMessages
+from tsgt.web.mission import MissionState
 from tsgt.web.recorded import index_of
 from tsgt.web.replay import ReplayMessages
 from tsgt.web.server import Page, serve
 from tsgt.web.source import follow
-from tsgt.web.state import MissionState
 
 if TYPE_CHECKING:
     from collections.abc import Callable

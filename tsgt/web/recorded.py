@@ -18,7 +18,7 @@ from tsgt.recording import (
     encode_line,
     read_lines,
 )
-from tsgt.web.mission_findings import kind
+from tsgt.web.mission.findings import kind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

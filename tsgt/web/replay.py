@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tsgt.web.live import INTERVAL_S
 from tsgt.web.messages import encode, message
-from tsgt.web.state import MissionState
+from tsgt.web.mission import MissionState
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Iterator, Mapping

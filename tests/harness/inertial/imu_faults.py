@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.config import ImuModelName
-    from tsgt.estimation.imu_setup_monitor import StartCheck
+    from tsgt.estimation.inertial.setup_monitor import StartCheck
     from tsgt.geometry import FloatArray
     from tsgt.model import Measurement, Parameters
     from tsgt.simulation.faults import FaultKind

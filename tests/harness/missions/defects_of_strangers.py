@@ -15,7 +15,7 @@ from tsgt.estimation import linear, tracks
 from tsgt.estimation.pose_batch import ImuUse, PoseBatch
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master import reacquisition_hints, statistics
-from tsgt.master.disk_monitor import DiskMonitor
+from tsgt.master.monitors.disk import DiskMonitor
 from tsgt.master.publisher import Publisher
 from tsgt.master.recording_thread import RecordingThread
 from tsgt.master.station_events import StationEventDetector

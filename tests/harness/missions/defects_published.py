@@ -14,7 +14,7 @@ import numpy as np
 from tsgt.estimation import observations, pose_output, tracks
 from tsgt.estimation.pose_batch import PoseBatch
 from tsgt.master.classic import ingest
-from tsgt.master.layout_monitor import LayoutMonitor
+from tsgt.master.monitors.layout import LayoutMonitor
 from tsgt.master.recording_thread import RecordingThread
 from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics

@@ -14,8 +14,8 @@ from tsgt.relay.buffer import LineBuffer
 from tsgt.relay.program import SourceReader
 from tsgt.relay.server import RelayServer
 from tsgt.simulation.checks.heard_lines import is_part_of_stream
+from tsgt.web.mission.state import MissionState
 from tsgt.web.source import follow
-from tsgt.web.state import MissionState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -23,8 +23,8 @@ from tsgt.recording import (
     encode_line,
 )
 from tsgt.web.live import LiveMessages
+from tsgt.web.mission.state import MissionState
 from tsgt.web.server import Page, Settings, serve
-from tsgt.web.state import MissionState
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine

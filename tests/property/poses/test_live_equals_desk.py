@@ -16,7 +16,7 @@ from hypothesis import given, settings
 
 from tsgt.config import GeofenceConfig
 from tsgt.estimation import LinearEstimator, LiveEstimator
-from tsgt.master.geofence import Geofence
+from tsgt.master.monitors.geofence import Geofence
 from tsgt.master.publisher import Publisher
 from tsgt.master.replay import replayed
 from tsgt.master.station_events import StationEventDetector

@@ -23,8 +23,8 @@ from harness.missions.field import DISK, STATIONS, TRUE, field_of, running
 from tsgt.config import AlarmsConfig, GeofenceConfig, ImuConfig
 from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError
 from tsgt.geometry import rotation_from_quaternion
-from tsgt.master.geofence import run_geofence_command
-from tsgt.master.imu_monitor import ImuUseMonitor
+from tsgt.master.monitors.geofence import run_geofence_command
+from tsgt.master.monitors.imu import ImuUseMonitor
 from tsgt.master.reload import RELOAD_SIGNAL
 from tsgt.master.replay import greeting, replayed
 from tsgt.model import ImuSamples, PolarMeasurement, Status

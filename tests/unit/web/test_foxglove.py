@@ -20,7 +20,7 @@ from structlog.testing import capture_logs
 from tsgt.clock import SystemClock
 from tsgt.recording import encode_line
 from tsgt.web.access import ATTEMPTS_PER_ADDRESS, Access
-from tsgt.web.state import MissionState
+from tsgt.web.mission.state import MissionState
 
 pytest.importorskip("foxglove", reason="the extra foxglove is not installed (pip install 'tsgt[foxglove]')")
 

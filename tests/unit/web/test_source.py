@@ -12,7 +12,7 @@ from tsgt.clock import SystemClock
 from tsgt.master.stream_server import StreamServer
 from tsgt.recording import encode_line
 from tsgt.web import source
-from tsgt.web.state import MissionState
+from tsgt.web.mission.state import MissionState
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

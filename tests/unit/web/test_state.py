@@ -12,7 +12,7 @@ from harness.readers.web import feed, mission, pose, station, status
 from tsgt.model import ReferencePoint, Status
 from tsgt.recording import DiskStatus, EventRecord, RecordingStatus, SetupRecord, StationShare, encode_line
 from tsgt.web.messages import encode, message
-from tsgt.web.state import MissionState
+from tsgt.web.mission.state import MissionState
 
 LEFT = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 """A quarter turn about the z axis."""

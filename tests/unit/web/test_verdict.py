@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from tsgt.web.verdict import GOOD, Finding, Hold, Level, PoseFacts, StreamFacts, judge
+from tsgt.web.mission.verdict import GOOD, Finding, Hold, Level, PoseFacts, StreamFacts, judge
 
 LIVE = StreamFacts(connected=True)
 VALID = PoseFacts(age_s=0.05, valid=True)

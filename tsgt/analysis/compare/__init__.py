@@ -4,6 +4,7 @@ Comes in: reference poses with covariance, estimates of other programs (poses or
 of their own point on the robot). Goes out: time offset, extrinsic and frame with uncertainties, and error statistics.
 """
 
+from tsgt.analysis.compare.alignment import fit, nested_fits, overlap_s
 from tsgt.analysis.compare.assessment import Assessment, assess
 from tsgt.analysis.compare.checks import (
     InputFinding,
@@ -21,8 +22,6 @@ from tsgt.analysis.compare.comparison import (
 from tsgt.analysis.compare.completeness import Completeness
 from tsgt.analysis.compare.error_table import error_csv
 from tsgt.analysis.compare.errors import TRAVEL_COMPONENTS, ErrorSeries, JudgedErrors
-from tsgt.analysis.compare.fitting import fit, nested_fits
-from tsgt.analysis.compare.initialisation import overlap_s
 from tsgt.analysis.compare.pairing import PairedPoses, pair
 from tsgt.analysis.compare.relation import (
     Alignment,

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tsgt.analysis.compare.alignment import fit, nested_fits
+from tsgt.analysis.compare.alignment.uncertainty import WEAK_SIGMA
 from tsgt.analysis.compare.assessment import MIN_POSES, Assessment, assess, paired
 from tsgt.analysis.compare.checks import input_findings, quaternion_finding, relative_offset_s
 from tsgt.analysis.compare.errors import JudgedErrors, absolute
-from tsgt.analysis.compare.fit_uncertainty import WEAK_SIGMA
-from tsgt.analysis.compare.fitting import fit, nested_fits
 from tsgt.analysis.compare.pairing import Pairing
 from tsgt.analysis.compare.relation import FitSettings, initial_relation
 from tsgt.errors import GeometryError

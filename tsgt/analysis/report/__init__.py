@@ -20,9 +20,8 @@ from tsgt.analysis.report.page import (
     format_utc,
     render_page,
 )
-from tsgt.analysis.report.sections import sections
+from tsgt.analysis.report.sections import map_figure, report_sections
 from tsgt.analysis.report.stations import StationRecord
-from tsgt.analysis.report.trajectory_sections import map_figure
 from tsgt.analysis.report.verdicts import verdicts
 
 __all__ = [
@@ -43,6 +42,6 @@ __all__ = [
     "map_figure",
     "render_page",
     "report_numbers",
-    "sections",
+    "report_sections",
     "verdicts",
 ]

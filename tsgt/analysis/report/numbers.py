@@ -12,11 +12,11 @@ from tsgt.analysis.evaluation import binned, gridded, held_out_keys, noise_scale
 from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.refinement import refinement_keys
-from tsgt.analysis.report.calibration import calibration_numbers
-from tsgt.analysis.report.diagnosis_section import diagnosis_numbers
 from tsgt.analysis.report.findings import position_sigma_mm, rotation_sigma_deg
-from tsgt.analysis.report.imu_section import imu_numbers
 from tsgt.analysis.report.page import nan_median
+from tsgt.analysis.report.sections.calibration import calibration_numbers
+from tsgt.analysis.report.sections.diagnosis import diagnosis_numbers
+from tsgt.analysis.report.sections.imu import imu_numbers
 from tsgt.analysis.report.verdicts import bound_and_speed, verdicts
 from tsgt.estimation import Kind, centroid_point, poses_at
 

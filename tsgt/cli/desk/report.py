@@ -16,7 +16,7 @@ from tsgt.analysis.report import (
     map_figure,
     render_page,
     report_numbers,
-    sections,
+    report_sections,
     verdicts,
 )
 from tsgt.analysis.report.log import read_log
@@ -162,7 +162,7 @@ def write_report(
         f"Report of {findings.path.name}",
         headline(findings),
         map_figure(findings),
-        sections(findings),
+        report_sections(findings),
         report_numbers(findings),
         on_progress=on_progress,
     )

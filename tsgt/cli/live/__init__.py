@@ -1,4 +1,4 @@
-"""Commands on the sockets of the daemons: ``listen``, ``status`` and ``replay``.
+"""Commands on the sockets of the daemons: ``listen``, ``status``, ``replay``, and ``relay`` and ``web`` to other computers.
 
 In: lines of a UNIX socket (`line_reader`, `follower`). Out: text, once or as lines (`status_text`, `tsgt.cli.render`), or a
 screen that is updated in place (`screen`).

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from tsgt.model import Vector3
-    from tsgt.web.state import MissionState
+    from tsgt.web.mission import MissionState
 
 TRAIL_INTERVAL_S = 1.0
 

@@ -18,8 +18,8 @@ from foxglove.messages import (
 
 from tsgt.model import ROBOT_FRAME
 from tsgt.web.frames import inverse, rotate
-from tsgt.web.mission_findings import kind
-from tsgt.web.state import plain
+from tsgt.web.mission.findings import kind
+from tsgt.web.mission.state import plain
 
 if TYPE_CHECKING:
     from tsgt.model import Row4

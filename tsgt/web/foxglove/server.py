@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from tsgt.clock import Clock
     from tsgt.web.foxglove.feed import Message
-    from tsgt.web.state import MissionState
+    from tsgt.web.mission import MissionState
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 

@@ -3,7 +3,7 @@ import pytest
 from harness.drives.compared_drive import START_NS, reference, robot
 
 from tsgt.analysis.compare import Estimate
-from tsgt.analysis.compare.drifting_frame import (
+from tsgt.analysis.compare.alignment.drifting_frame import (
     NAMES,
     Linearised,
     Rows,

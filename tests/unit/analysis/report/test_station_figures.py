@@ -9,7 +9,7 @@ pytest.importorskip("matplotlib")
 
 from tsgt.analysis.figures import TimeAxis, drawing
 from tsgt.analysis.report import StationRecord
-from tsgt.analysis.report.station_figures import draw_clocks, draw_gaps
+from tsgt.analysis.report.figures.stations import draw_clocks, draw_gaps
 
 SECOND = 1_000_000_000
 

@@ -11,7 +11,7 @@ from harness.files.records import HEADER, START
 from harness.inertial.imu_recording import IMU, imu_recording, shaken_drive, write
 
 from tsgt.analysis.formats import write_imu_mounting
-from tsgt.analysis.report import collect_findings, report_numbers, sections
+from tsgt.analysis.report import collect_findings, report_numbers, report_sections
 from tsgt.model import OdometryParameters, OdometrySamples, SetupCovariance
 from tsgt.recording import encode_line
 
@@ -118,7 +118,7 @@ def test_report_shows_imu_and_wheels(tmp_path: Path) -> None:
     assert wheels["scale"] == pytest.approx(1 / 0.98 - 1, abs=3 * wheels["scale_sigma"])
     assert wheels["slip_rms"] < 0.02
     assert wheels["rejected"] < 0.05
-    (section,) = [each for each in sections(found) if each.title == "IMU of the robot"]
+    (section,) = [each for each in report_sections(found) if each.title == "IMU of the robot"]
     assert "stations 1, 2, 3" in section.text[0]
     assert "Wheel odometry" in [table.caption for table in section.tables]
     section.plots[0].write([tmp_path / "biases.png"])

@@ -18,7 +18,14 @@ from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, 
 
 from tsgt.analysis.evaluation import read_tum
 from tsgt.analysis.formats import read_stationary_intervals
-from tsgt.analysis.report import Findings, collect_findings, map_figure, report_numbers, sections, verdicts
+from tsgt.analysis.report import (
+    Findings,
+    collect_findings,
+    map_figure,
+    report_numbers,
+    report_sections,
+    verdicts,
+)
 from tsgt.analysis.report.page import Headline
 from tsgt.cli.desk.report import write_page
 from tsgt.cli.main import cli, run
@@ -95,13 +102,13 @@ def report_text(found: Findings) -> str:
     """Everything that a report says in sentences."""
     return "\n".join(
         [f"{v.text} {v.repair}" for v in verdicts(found)]
-        + [text for section in sections(found) for text in section.text]
+        + [text for section in report_sections(found) for text in section.text]
     )
 
 
 def drawn(found: Findings, folder: Path, *names: str) -> set[str]:
     """Draw the named figures of a report; return the names of all."""
-    plots = {plot.name: plot for section in sections(found) for plot in section.plots}
+    plots = {plot.name: plot for section in report_sections(found) for plot in section.plots}
     path_map = map_figure(found)
     plots |= {} if path_map is None else {path_map.name: path_map}
     for name in names:

@@ -14,7 +14,8 @@ from harness.inertial.imu_faults import Drive, confirm_once
 from harness.missions.missions import SUPERFRAME, run_mission
 
 from tsgt.config import ScenarioConfig, SimulatedImu
-from tsgt.estimation import centroid_at_point, imu_setup_monitor
+from tsgt.estimation import centroid_at_point
+from tsgt.estimation.inertial import setup_monitor as imu_setup_monitor
 from tsgt.geometry import log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.geometry.inertial_calibration import SetupCheck
 from tsgt.recording import load_recording, read_imu_samples

@@ -1,0 +1,587 @@
+"""The estimator ``continuous`` with an IMU: which trajectory poses rest on, and the order of records."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import numpy as np
+import pytest
+from harness.drives.scene import SECOND, START, Scene, driving, stationary_scene
+from harness.files.records import IMU_PARAMETERS, imu_samples
+
+from tsgt.estimation import LiveEstimator
+from tsgt.estimation.continuous import ContinuousEstimator
+from tsgt.estimation.inertial import setup_monitor as imu_setup_monitor
+from tsgt.estimation.inertial.takeover import (
+    PROVEN_S,
+    QUARANTINE_S,
+    SILENCE_S,
+    SOUND_S,
+    UNAIDED_S,
+    ImuState,
+    ImuTakeover,
+)
+from tsgt.estimation.pose_batch import ImuUse
+from tsgt.geometry.inertial import WheelsEstimate
+from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
+from tsgt.geometry.trajectory import FixedLagSmoother
+from tsgt.model import ImuSamples, Measurement, OdometryParameters, OdometrySamples
+from tsgt.recording import PoseRecord, encode_line
+
+if TYPE_CHECKING:
+    from tsgt.geometry.inertial import InertialSamples, SaturationMonitor, WheelSamples
+    from tsgt.model import ImuParameters, MotionPrior
+
+LINE_S = 0.05
+UP_M = 0.02
+RIGHT = SetupCheck(confirmed=True)
+
+
+class FakeInertialSmoother(FixedLagSmoother):
+    """A smoother without IMU in the place of one with: its poses are ``up_m`` higher."""
+
+    created: ClassVar[list[FakeInertialSmoother]] = []
+
+    def __init__(
+        self, _imu: ImuParameters, prior: MotionPrior, *, saturation: SaturationMonitor, **_: Any
+    ) -> None:
+        super().__init__(prior)
+        self.saturation = saturation
+        self.up_m = UP_M
+        self.health: str | None = None
+        self.setup_in_doubt = self.blow = False
+        self.contradicted = False
+        self.wheels: WheelsEstimate | None = None
+        self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
+        self.samples: list[InertialSamples] = []
+        self.created.append(self)
+
+    def add_samples(self, samples: InertialSamples) -> None:
+        """Keep samples."""
+        self.samples.append(samples)
+
+    def add_odometry(self, _: WheelSamples) -> None:
+        """Use none."""
+
+    def predict(self, time_s: float, *, dim: int = 18) -> Any:
+        """Predict as without IMU, but higher."""
+        state, covariance = super().predict(time_s, dim=dim)
+        return replace(state, position=state.position + [0.0, 0.0, self.up_m]), covariance  # noqa: RUF005
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether measurements contradict it."""
+        return self.contradicted or super().ambiguous
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
+    """Three stations, a robot that drives a bend, and an IMU."""
+    FakeInertialSmoother.created.clear()
+    monkeypatch.setattr("tsgt.estimation.continuous.InertialFixedLagSmoother", FakeInertialSmoother)
+    monkeypatch.setattr(imu_setup_monitor, "FIRST_NS", 0)
+    monkeypatch.setattr(imu_setup_monitor, "RESULT_NS", 0)
+    monkeypatch.setattr(imu_setup_monitor, "UNCONFIRMED_INTERVAL_NS", SECOND // 2)
+    scene = stationary_scene().moving(driving).with_limits(estimator="continuous", period_ns=100_000_000)
+    return replace(scene, parameters=replace(scene.parameters, imu=IMU_PARAMETERS))
+
+
+def arrivals(
+    scene: Scene, until_s: float, silent: tuple[float, float] = (np.inf, np.inf)
+) -> list[Measurement | ImuSamples]:
+    """Measurements of the stations in turn and lines of the IMU, but for a time without, in the order of arrival."""
+    found: list[Measurement | ImuSamples] = [
+        replace(scene.measure(station, time_s + 0.1 * station), sequence=number)
+        for number, time_s in enumerate(np.arange(0.0, until_s, 0.4).tolist())
+        for station in (1, 2, 3)
+    ]
+    for line in range(round(until_s / LINE_S)):
+        record = imu_samples(10 * line)
+        if not silent[0] <= line * LINE_S < silent[1]:
+            found.append(record)
+    found = [each for each in found if each.received_ns <= START + until_s * SECOND]
+    return sorted(found, key=lambda each: each.received_ns)
+
+
+def checked(scene: Scene, check: SetupCheck = RIGHT) -> LiveEstimator:
+    """Return a live estimator whose checks of the set-up give one result."""
+    return LiveEstimator(scene.parameters, lambda _work: lambda: check)
+
+
+def records(scene: Scene, arrived: list[Measurement | ImuSamples]) -> list[Any]:
+    """Hand arrivals to a live estimator and return its records."""
+    live = checked(scene)
+    return [
+        record
+        for each in arrived
+        for record in (live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each))
+    ]
+
+
+def predicted(found: list[Any]) -> list[PoseRecord]:
+    """Return the predicted poses."""
+    return [each for each in found if isinstance(each, PoseRecord) and each.kind == "predicted"]
+
+
+def time_of(pose: PoseRecord) -> float:
+    """Time of a pose from the start."""
+    return (pose.stamp_ns - START) / SECOND
+
+
+def uses_from(poses: list[PoseRecord]) -> list[tuple[str | None, float]]:
+    """Each use of the IMU, and from when."""
+    return [
+        (pose.imu, time_of(pose))
+        for before, pose in zip([None, *poses], poses, strict=False)
+        if before is None or before.imu != pose.imu
+    ]
+
+
+def test_poses_use_the_imu_once_its_trajectory_has_converged(scene: Scene) -> None:
+    """Before, they are those without it."""
+    poses = predicted(records(scene, arrivals(scene, 4.0)))
+    (starting, _), (used, from_s) = uses_from(poses)
+    assert (starting, used) == ("starting", "used")
+    assert from_s < 1.5
+    assert poses[-1].position_m is not None
+    assert poses[-1].position_m[2] == pytest.approx(-1.0 + UP_M, abs=1e-3)
+
+
+def test_silence_gives_the_poses_without_imu_and_sound_samples_take_it_back(scene: Scene) -> None:
+    """Within 0.5 s of the last sample, from measurements that were held; and with a jump on the pose."""
+    poses = predicted(records(scene, arrivals(scene, 4.5, silent=(2.0, 2.8))))
+    _, _, (silent, silent_s), (used, used_s) = uses_from(poses)
+    assert (silent, used) == ("silent", "used")
+    assert silent_s == pytest.approx(2.0 + SILENCE_S, abs=0.11)
+    assert used_s == pytest.approx(2.8 + SOUND_S, abs=0.16)
+    without = replace(scene, parameters=replace(scene.parameters, imu=None))
+    expected = {pose.stamp_ns: pose for pose in predicted(records(without, arrivals(scene, 4.5)))}
+    for pose in poses:
+        if silent_s <= time_of(pose) < used_s:
+            other = expected[pose.stamp_ns]
+            assert pose.valid
+            assert pose.position_m == pytest.approx(other.position_m, abs=2e-4)
+            assert pose.covariance == pytest.approx(other.covariance, rel=0.05, abs=1e-7)
+    jumps = [pose.jump_m for pose in poses if time_of(pose) in (silent_s, used_s)]
+    assert jumps == pytest.approx([UP_M, UP_M], abs=4e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "cause"),
+    [
+        ({"up_m": 5.0}, "sigmas from those without"),
+        ({"contradicted": True}, "prisms contradict it"),
+        ({"health": "it is stuck"}, "it is stuck"),
+    ],
+)
+def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any], cause: str) -> None:
+    """Until nothing from before is in the window."""
+    arrived = arrivals(scene, 7.2)
+    live = checked(scene)
+    poses: list[PoseRecord] = []
+    states: list[ImuState | None] = []
+    for each in arrived:
+        if each.received_ns > START + 2 * SECOND and len(FakeInertialSmoother.created) == 1:
+            vars(FakeInertialSmoother.created[0]).update(wrong)
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+        states.append(live.imu_state())
+    assert states[-1] == ImuState(ImuUse.USED, "", (0.001, 0.002, -0.003), (0.01, -0.02, 0.03))
+    assert any(state.use == ImuUse.DISAGREES and cause in state.disagreement for state in states if state)
+    _, _, (disagrees, from_s), (used, until_s) = uses_from(poses)
+    assert (disagrees, used) == ("disagrees", "used")
+    assert 2.0 < from_s < 2.65
+    assert until_s == pytest.approx(from_s + QUARANTINE_S, abs=0.11)
+    assert len(FakeInertialSmoother.created) == 2
+    # What the first has learned of the device's limits
+    assert len({id(each.saturation) for each in FakeInertialSmoother.created}) == 1
+
+
+def test_poses_after_a_takeover_are_those_of_an_estimator_without_imu(scene: Scene) -> None:
+    """To the bit: measurements from before the takeover still arrive, though the window with the IMU has begun anew after them."""
+    live = checked(scene)
+    poses: list[PoseRecord] = []
+    arrived = arrivals(scene, 5.0)
+    for each in arrived:
+        if each.received_ns > START + 2 * SECOND and len(FakeInertialSmoother.created) == 1:
+            FakeInertialSmoother.created[0].health = "it is stuck"
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += [pose for pose in found if isinstance(pose, PoseRecord)]
+        if len(FakeInertialSmoother.created) > 1:
+            FakeInertialSmoother.created[-1]._horizon_s = 2.5  # of its first sample
+    without = replace(scene, parameters=replace(scene.parameters, imu=None))
+    others = [pose for pose in records(without, arrived) if isinstance(pose, PoseRecord)]
+    expected = {(pose.series, pose.stamp_ns): pose for pose in others}
+    # Samples advance the estimator too: at the last instant a measurement counts a call later without them.
+    taken_over = [pose for pose in poses if pose.imu == "disagrees" and time_of(pose) < 4.95]
+    assert len(taken_over) > 20
+    for pose in taken_over:
+        other = expected[pose.series, pose.stamp_ns]
+        assert pose.position_m == other.position_m
+        assert pose.covariance == other.covariance
+        assert pose.valid == other.valid
+
+
+def test_wrong_setup_is_left_out_from_its_event_on(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses do not rest on an IMU that a drive has shown to be set up wrongly."""
+    wrong = SetupCheck((SetupFinding("rotation", 0.02, 0.001, "the mounting is wrong"),))
+    checks = [RIGHT, wrong]
+    monkeypatch.setattr(imu_setup_monitor, "INTERVAL_NS", 2 * SECOND)
+    live = LiveEstimator(scene.parameters, lambda _work: lambda: checks.pop(0))
+    poses: list[PoseRecord] = []
+    for each in arrivals(scene, 4.0):
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    _, event = live.imu_setup_events()
+    assert event.event == "imu_setup_wrong"
+    state = live.imu_state()
+    assert state is not None
+    assert state.disagreement == "the mounting is wrong"
+    _, _, (use, from_s) = uses_from(poses)
+    assert use == "wrong_setup"
+    assert from_s == pytest.approx((event.stamp_ns - START) / SECOND, abs=0.11)
+
+
+def test_unconfirmed_imu_is_not_used(scene: Scene) -> None:
+    """Poses are those without it, and the status says what the drive has not told yet."""
+    live = checked(scene, SetupCheck(excluded=frozenset({"axes"})))
+    poses: list[PoseRecord] = []
+    for each in arrivals(scene, 3.0):
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    _, (use, _) = uses_from(poses)
+    assert use == "unconfirmed"
+    assert poses[-1].position_m is not None
+    assert poses[-1].position_m[2] == pytest.approx(-1.0, abs=1e-3)
+    state = live.imu_state()
+    assert state is not None
+    assert state.disagreement == "not confirmed by driving yet: mounting, position, latency"
+
+
+def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
+    """Two of three stations that measure have no poses without it; with the third there are."""
+    without = SimpleNamespace(converged=False, ambiguous=False)
+    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
+    setup = SimpleNamespace(untrusted=None, confirmed=False)
+    takeover = ImuTakeover(
+        IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
+    )
+    takeover.begin(START)
+    uses = []
+    for number in range(3 * round(UNAIDED_S)):
+        takeover.add_samples(imu_samples(100 * number, count=100))
+        takeover.take_samples()
+        takeover.choose(0.5 * (number + 1))
+        uses.append(takeover.use)
+        without.converged = number >= 2.5 * UNAIDED_S
+        without.ambiguous = True
+    changes = [use for use, _ in itertools.groupby(uses)]
+    assert changes == [ImuUse.UNCONFIRMED, ImuUse.USED, ImuUse.UNCONFIRMED]
+    assert uses.index(ImuUse.USED) == round(2 * UNAIDED_S)
+
+
+@pytest.fixture
+def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuTakeover, SimpleNamespace, SimpleNamespace]:
+    """Return what chooses, a window with IMU, and the monitor of its set-up; all is well."""
+    monkeypatch.setattr(ImuTakeover, "_compare", lambda *_: None)
+    without = SimpleNamespace(converged=True, ambiguous=False)
+    window = SimpleNamespace(
+        converged=True,
+        ambiguous=False,
+        health=None,
+        setup_in_doubt=False,
+        blow=False,
+        add_samples=lambda _: None,
+    )
+    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="", blow=False)
+    setup.restart = lambda *, blow: vars(setup).update(confirmed=False, blow=blow)
+    takeover = ImuTakeover(
+        IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
+    )
+    takeover.begin(START)
+    return takeover, window, setup
+
+
+def uses_of(takeover: ImuTakeover, from_s: float, until_s: float) -> list[tuple[ImuUse, float]]:
+    """Choose ten times a second; return each use, and for how long."""
+    uses = []
+    for number in range(round(10 * from_s), round(10 * until_s)):
+        takeover.add_samples(imu_samples(20 * number, count=20))
+        takeover.take_samples()
+        takeover.choose(0.1 * (number + 1))
+        uses.append(takeover.use)
+    return [(use, 0.1 * len(list(each))) for use, each in itertools.groupby(uses)]
+
+
+@pytest.mark.parametrize(
+    ("fault", "use"), [("stuck", ImuUse.USED), ("blow", ImuUse.UNCONFIRMED), ("prisms", ImuUse.UNCONFIRMED)]
+)
+def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace], fault: str, use: ImuUse
+) -> None:
+    """After a blow, and where the prisms contradict, the IMU may have moved for good."""
+    takeover, window, setup = sound
+    uses_of(takeover, 0.0, 1.0)
+    window.health, window.blow = (fault if fault != "prisms" else None), fault == "blow"
+    window.setup_in_doubt = window.blow
+    window.ambiguous = fault == "prisms"
+    found = [uses_of(takeover, 1.0, 1.6)[-1][0]]
+    window.health, window.setup_in_doubt, window.ambiguous = None, False, False
+    found.append(uses_of(takeover, 1.6, 7.0)[-1][0])
+    assert setup.blow == (fault == "blow")
+    setup.confirmed = True
+    found.append(uses_of(takeover, 7.0, 7.1)[-1][0])
+    assert found == [ImuUse.DISAGREES, use, ImuUse.USED]
+
+
+@pytest.mark.parametrize(
+    ("prisms", "in_doubt", "expected"),
+    [(3, False, [4.0, 8.0, 16.0, 4.0]), (2, True, [4.0, 8.0, 16.0, 4.0]), (2, False, [4.0, 4.0, 4.0, 4.0])],
+)
+def test_quarantine_doubles_with_each_disagreement_in_a_row(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+    monkeypatch: pytest.MonkeyPatch,
+    prisms: int,
+    expected: list[float],
+    *,
+    in_doubt: bool,
+) -> None:
+    """And is short again after a minute of use; it stays short where two prisms alone lose their poses to what the samples show."""
+    takeover, window, setup = sound
+    monkeypatch.setattr(takeover, "_prisms", prisms)
+    window.setup_in_doubt, window.followed_for_s = in_doubt, 0.0
+    setup.restart = lambda **_: None
+    found, now_s = [], 0.0
+    for used_s in (1.0, 1.0, 1.0, PROVEN_S + 1.0):
+        uses_of(takeover, now_s, now_s + used_s)
+        window.health = "stuck"
+        uses_of(takeover, now_s + used_s, now_s + used_s + 0.1)
+        window.health = None
+        (_, wrong_s), _ = uses_of(takeover, now_s + used_s + 0.1, now_s + used_s + 20.0)
+        found.append(wrong_s)
+        now_s += used_s + 0.1 + wrong_s
+    assert found == pytest.approx(expected, abs=0.11)
+
+
+def test_samples_between_rare_poses_are_all_used() -> None:
+    """Also where poses are ten seconds apart; only before the first measurement old ones are forgotten."""
+    taken: list[InertialSamples] = []
+    driven: list[WheelSamples] = []
+    window = SimpleNamespace(add_samples=taken.append, add_odometry=driven.append)
+    takeover = ImuTakeover(
+        IMU_PARAMETERS, cast("Any", None), lambda: cast("Any", window), odometry=OdometryParameters()
+    )
+    for number in range(60):  # Half seconds
+        if number == 40:
+            takeover.begin(START)
+        record = imu_samples(100 * number, count=100)
+        takeover.add_samples(record)
+        takeover.add_odometry(wheels_beside(record))
+    takeover.take_samples()
+    (samples,), (wheels,) = taken, driven
+    assert 3000 <= len(samples) <= 3100
+    assert 30 <= len(wheels) <= 31
+
+
+def test_silence_does_not_shorten_a_quarantine(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+) -> None:
+    """An IMU that disagreed and then is silent for half a second is used no sooner."""
+    takeover, window, _ = sound
+    uses_of(takeover, 0.0, 1.0)
+    window.health = "stuck"
+    uses_of(takeover, 1.0, 1.1)
+    window.health = None
+    uses_of(takeover, 1.1, 2.0)
+    takeover.choose(2.5)
+    found = uses_of(takeover, 2.5, 10.0)
+    assert [use for use, _ in found] == [ImuUse.SILENT, ImuUse.USED]
+    assert found[0][1] == pytest.approx(1.1 + QUARANTINE_S - 2.5, abs=0.11)
+
+
+def test_unconfirmed_imu_is_not_used_sooner_because_stations_had_none_long_ago(
+    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+) -> None:
+    """The time without a trajectory of the stations counts from when that was lost, also while the IMU was used."""
+    takeover, window, setup = sound
+    setup.confirmed = False
+    uses_of(takeover, 0.0, 1.0)
+    setup.confirmed = True
+    uses_of(takeover, 1.0, 30.0)
+    cast("Any", takeover._without).converged = False
+    window.health, window.setup_in_doubt, window.blow = "a blow", True, True
+    uses_of(takeover, 30.0, 30.1)
+    window.health = None
+    found = uses_of(takeover, 30.1, 50.0)
+    assert [use for use, _ in found] == [ImuUse.DISAGREES, ImuUse.UNCONFIRMED, ImuUse.USED]
+    assert 0.1 + found[0][1] + found[1][1] == pytest.approx(UNAIDED_S, abs=0.21)
+
+
+def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In its covariance, and it is degraded."""
+    confirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
+    monkeypatch.setattr(ImuTakeover, "unconfirmed", True)
+    unconfirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
+    assert "imu_unconfirmed" not in confirmed.degraded_by
+    assert unconfirmed.degraded_by == ("imu_unconfirmed",)
+    assert confirmed.covariance is not None
+    assert unconfirmed.covariance is not None
+    added = np.diag((np.array(unconfirmed.covariance) - np.array(confirmed.covariance)).reshape(6, 6))
+    assert np.sqrt(added[3:]) == pytest.approx(np.radians(0.5), rel=1e-3)
+    assert (np.sqrt(added[:3]) >= 0.0049).all()
+
+
+def test_outage_of_all_prisms_with_an_unconfirmed_imu(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is wrong in the set-up grows with time: there are no valid poses beyond the outage limit, which a confirmed one has."""
+    pipeline = replace(scene.parameters.pipeline, outage_limit_ns=3 * SECOND // 10)
+    scene = replace(scene, parameters=replace(scene.parameters, pipeline=pipeline))
+    last_ns = START + 5 * SECOND // 2
+    arrived = [
+        each for each in arrivals(scene, 3.2) if isinstance(each, ImuSamples) or each.stamp_ns < last_ns
+    ]
+
+    def in_outage() -> list[PoseRecord]:
+        return [each for each in predicted(records(scene, arrived)) if time_of(each) > 2.85]
+
+    assert any(each.valid for each in in_outage())
+    monkeypatch.setattr(ImuTakeover, "unconfirmed", True)
+    assert {(each.valid, each.reason) for each in in_outage()} == {(False, "outage")}
+
+
+STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
+
+
+@pytest.mark.parametrize(
+    ("prisms", "followed_for_s", "health", "contradicted"),
+    [
+        (1, 0.4, None, True),
+        (1, 0.0, None, False),
+        (2, 0.4, None, True),
+        (3, 0.4, None, False),
+        (1, 0.0, DISAGREES, True),
+        (1, 0.0, STUCK, False),
+        (2, 0.0, DISAGREES, False),
+    ],
+)
+def test_contradiction_of_one_or_two_stations_lasts(
+    prisms: int, followed_for_s: float, health: str | None, *, contradicted: bool
+) -> None:
+    """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""
+    without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
+    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
+    window.setup_in_doubt = window.blow = False
+    takeover = ImuTakeover(IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), prisms=prisms)
+    takeover.begin(START)
+    found = []
+    for number in range(20):
+        window.ambiguous = 8 <= number < 12
+        window.followed_for_s = followed_for_s if number >= 12 else 0.0
+        window.health = health if number == 10 else None
+        takeover.add_samples(imu_samples(100 * number, count=100))
+        takeover.take_samples()
+        takeover.choose(0.5 * (number + 1))
+        found.append(takeover.station_contradicted)
+    assert not any(found[:10])
+    assert found[-1] == contradicted
+
+
+def test_poses_of_a_contradicted_station_are_invalid(scene: Scene) -> None:
+    """And say why."""
+    live = checked(scene)
+    poses = []
+    for each in arrivals(scene, 3.0):
+        estimator = live._estimator
+        assert isinstance(estimator, ContinuousEstimator)
+        assert estimator._imu is not None
+        estimator._imu.station_contradicted = each.received_ns > START + 2 * SECOND
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    reasons = {pose.reason for pose in poses if time_of(pose) > 2.1}
+    assert reasons == {"contradicted"}
+    assert any(pose.valid for pose in poses)
+
+
+def test_first_pose_after_a_measurement_states_its_jump(scene: Scene) -> None:
+    """And no other."""
+    found = records(scene, arrivals(scene, 4.0))
+    poses = [pose for pose in predicted(found) if time_of(pose) > 2.0]
+    measured = [each.received_ns for each in found if isinstance(each, Measurement)]
+    for before, pose in itertools.pairwise(poses):
+        new = any(before.stamp_ns <= at_ns < pose.stamp_ns for at_ns in measured)
+        assert (pose.jump_m is not None) == new
+        assert pose.jump_m is None or pose.jump_m < 0.05
+
+
+def test_samples_follow_the_poses_due_before_them(scene: Scene) -> None:
+    """In their place among all records, and at no instant before."""
+    live = LiveEstimator(scene.parameters)
+    live.measurement(scene.measure(1, 0.0))
+    *poses, samples = live.imu_samples(imu_samples(100))
+    assert poses
+    assert all(isinstance(pose, PoseRecord) for pose in poses)
+    assert samples == imu_samples(100)
+    (clamped,) = live.imu_samples(imu_samples(90))
+    assert clamped.received_ns == imu_samples(100).received_ns  # type: ignore[union-attr]
+
+
+def test_samples_change_nothing_without_parameters_of_an_imu(scene: Scene) -> None:
+    """Bit for bit, also the instants of measurements."""
+    without = replace(scene, parameters=replace(scene.parameters, imu=None))
+    arrived = arrivals(scene, 3.0)
+    alone = records(without, [each for each in arrived if not isinstance(each, ImuSamples)])
+    mixed = [each for each in records(without, arrived) if not isinstance(each, ImuSamples)]
+    count = min(len(alone), len(mixed))
+    assert list(map(encode_line, alone[:count])) == list(map(encode_line, mixed[:count]))
+    assert b'"imu"' not in encode_line(alone[-1])
+
+
+def test_smoother_gets_all_samples_from_before_its_measurements_on(scene: Scene) -> None:
+    """Each once, in their order."""
+    records(scene, arrivals(scene, 2.0))
+    end_s = np.concatenate([each.end_s for each in FakeInertialSmoother.created[0].samples])
+    assert np.diff(end_s) == pytest.approx(0.005, abs=1e-9)
+    assert end_s[0] < 0.0
+
+
+@pytest.mark.parametrize(("rejected_s", "use"), [(1.9, "used"), (2.1, "disagrees")])
+def test_use_of_wheels_is_known(scene: Scene, rejected_s: float, use: str) -> None:
+    """They are silent a second after the last sample, and without IMU there is none."""
+    parameters = replace(scene.parameters, odometry=OdometryParameters())
+    live = LiveEstimator(parameters, lambda _work: lambda: RIGHT)
+    words: list[tuple[str, float]] = []
+    for each in arrivals(scene, 6.0, silent=(3.5, np.inf)):
+        if isinstance(each, ImuSamples):
+            live.imu_samples(each)
+            if each.received_ns < START + 2 * SECOND:
+                live.odometry_samples(wheels_beside(each))
+        else:
+            live.measurement(each)
+        wheels = WheelsEstimate(np.zeros(3), np.ones(3), 4.0, rejected_s)
+        FakeInertialSmoother.created[0].wheels = wheels
+        state = live.imu_state()
+        assert state is not None
+        assert state.odometry is not None
+        if not words or words[-1][0] != state.odometry.use:
+            words.append((state.odometry.use, (each.received_ns - START) / SECOND))
+    assert [word for word, _ in words] == ["silent", "without_imu", use, "silent"]
+    assert words[-1][1] == pytest.approx(3.0, abs=0.1)
+    assert live.imu_state() is not None
+
+
+def wheels_beside(samples: ImuSamples) -> OdometrySamples:
+    """Return one sample of wheel odometry that ends with a line of the IMU."""
+    return OdometrySamples(
+        sequence=samples.sequence // 10,
+        received_ns=samples.received_ns,
+        stamp_ns=samples.stamp_ns[-1:],
+        duration_ns=(50_000_000,),
+        instrument_time_ns=None,
+        speed_mps=(0.5,),
+        yaw_rate_radps=None,
+        valid=(True,),
+    )

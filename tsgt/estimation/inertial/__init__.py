@@ -1,0 +1,36 @@
+"""The robot's IMU and wheels in the estimation: their samples as arrays, a check of the set-up, and when they are used. Sans-I/O.
+
+In: recorded samples, measurements and parameters. Out: arrays for the estimator (`samples`, `wheels`), a set-up that is confirmed or
+contradicted while the robot drives (`setup_monitor`), and the trajectory with or without the IMU (`takeover`).
+"""
+
+from tsgt.estimation.inertial.samples import SampleConverter, inertial_samples
+from tsgt.estimation.inertial.setup_monitor import (
+    ImuSetupMonitor,
+    StartCheck,
+    check_recorded_setup,
+    start_now,
+)
+from tsgt.estimation.inertial.takeover import (
+    ImuState,
+    ImuTakeover,
+    OdometryState,
+    QueriedTrajectory,
+    TrajectoryWindow,
+)
+from tsgt.estimation.inertial.wheels import wheel_samples
+
+__all__ = [
+    "ImuSetupMonitor",
+    "ImuState",
+    "ImuTakeover",
+    "OdometryState",
+    "QueriedTrajectory",
+    "SampleConverter",
+    "StartCheck",
+    "TrajectoryWindow",
+    "check_recorded_setup",
+    "inertial_samples",
+    "start_now",
+    "wheel_samples",
+]

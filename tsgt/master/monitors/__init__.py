@@ -1,0 +1,11 @@
+"""What the master watches beside the radio: geofences, the layout of stations and prisms, the use of the IMU, the disk.
+
+In: poses and what they rest on (`observers` connects them with the publisher), results of writing. Out: events for the stream and the
+recording, and the configured command of a geofence.
+"""
+
+from tsgt.master.monitors.disk import DiskMonitor
+from tsgt.master.monitors.imu import ImuUseMonitor, OdometryUseMonitor
+from tsgt.master.monitors.observers import GeofenceObserver, layout_monitor
+
+__all__ = ["DiskMonitor", "GeofenceObserver", "ImuUseMonitor", "OdometryUseMonitor", "layout_monitor"]

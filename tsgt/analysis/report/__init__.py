@@ -20,7 +20,8 @@ from tsgt.analysis.report.page import (
     format_utc,
     render_page,
 )
-from tsgt.analysis.report.sections import map_figure, report_sections
+from tsgt.analysis.report.sections.document import report_sections
+from tsgt.analysis.report.sections.trajectories import map_figure
 from tsgt.analysis.report.stations import StationRecord
 from tsgt.analysis.report.verdicts import verdicts
 

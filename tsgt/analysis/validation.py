@@ -68,7 +68,7 @@ def check_time_span(parameters: Parameters, measurements: Sequence[Measurement],
     if span_ns > MAX_EPOCHS * parameters.pipeline.period_ns:
         raise RecordingError(
             f"its measurements span {span_ns / 86_400e9:.1f} days, too many for one trajectory: "
-            "remove those with timestamps of a wrong clock, or process with a lower --rate",
+            "remove those with timestamps of a wrong clock (or, for `tsgt process`, give a lower --rate)",
             path=path,
         )
 

@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field, model_validator
 
-from tsgt.config.base import Model, Positive
+from tsgt.config.base import Argument, Model, Positive
 
 AlarmName = Literal[
     "station_lost",
@@ -89,7 +89,7 @@ class AlarmsConfig(Model):
     """Events that are alarms; the events that end them may be added."""
     min_interval_s: Positive = 60.0
     """Minimum time between alarms of the same event and station or geofence; the last one of those in between follows then."""
-    command: tuple[str, ...] = ()
+    command: tuple[Argument, ...] = ()
     """Program and arguments run at each alarm, with the alarm as a JSON line on stdin and TSGT_EVENT, TSGT_SITE, TSGT_MESSAGE
     and TSGT_STATION in its environment."""
     webhook: Annotated[str, AfterValidator(_web_address)] | None = None

@@ -23,6 +23,16 @@ Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
 Place = tuple[Coordinate, Coordinate, Coordinate]
 
 
+def _without_zero_byte(text: str) -> str:
+    if "\0" in text:
+        raise ValueError("it cannot contain a zero byte")
+    return text
+
+
+Argument = Annotated[str, AfterValidator(_without_zero_byte)]
+"""A word of a command, or a name that the kernel takes."""
+
+
 def relative_to_file(path: Path, info: ValidationInfo) -> Path:
     """Return a path of a configuration; a relative one counts from the file's folder."""
     if "\0" in str(path):

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from tsgt.config.base import Model, Positive, RelativePath, SocketPath, relative_to_file
+from tsgt.config.base import Argument, Model, Positive, RelativePath, SocketPath, relative_to_file
 from tsgt.config.radio import ProtocolConfig, RadioConfig, check_numbers
 
 Baud = Literal[2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 921_600]
@@ -123,7 +123,7 @@ class BridgeInstrumentConfig(Model):
 
     kind: Literal["bridge"]
     """An instrument behind a program."""
-    command: Annotated[tuple[str, ...], Field(min_length=1)]
+    command: Annotated[tuple[Argument, ...], Field(min_length=1)]
     """Program and arguments; it is restarted when it ends."""
     stall_timeout_s: Positive = 5.0
     """A program without output for this long while it should measure is restarted."""

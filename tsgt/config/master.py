@@ -8,7 +8,16 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from tsgt.config.alarms import AlarmsConfig
-from tsgt.config.base import Model, NoiseConfig, Number, Positive, RelativePath, SocketPath, unique_by
+from tsgt.config.base import (
+    Argument,
+    Model,
+    NoiseConfig,
+    Number,
+    Positive,
+    RelativePath,
+    SocketPath,
+    unique_by,
+)
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import MasterProtocolConfig, RadioConfig, check_numbers
 from tsgt.config.sensors import ImuConfig, OdometryConfig
@@ -104,7 +113,7 @@ class GeofenceConfig(Model):
     """Additional distance on the allowed side that ends a violation."""
     lost_after_s: Positive = 2.0
     """Without a valid pose for this long the geofence counts as violated."""
-    command: tuple[str, ...] = ()
+    command: tuple[Argument, ...] = ()
     """Program and arguments run at each crossing, with TSGT_EVENT and TSGT_FENCE in its environment."""
 
 

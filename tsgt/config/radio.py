@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from tsgt.config.base import Model, RelativePath
+from tsgt.config.base import Argument, Model, RelativePath, SocketPath
 
 Pin = Annotated[int, Field(ge=0, le=1000)]
 
@@ -55,7 +55,7 @@ class WiringConfig(Model):
     """Pin DIO0, BCM number."""
     nss_pin: Annotated[int, Field(ge=-1, le=1000)] = 25
     """Chip select, BCM number; -1 leaves it to the SPI driver of the kernel."""
-    gpio_chip: str | None = None
+    gpio_chip: Argument | None = None
     """GPIO device such as /dev/gpiochip0, gpiod only; default: found by its label."""
 
 
@@ -81,7 +81,7 @@ class SimulatedRadioConfig(ModemConfig):
 
     kind: Literal["simulated"]
     """A simulated radio."""
-    air_socket: RelativePath
+    air_socket: SocketPath
     """UNIX socket of the air server."""
     name: str
     """Name of this radio on the channel, unique for each daemon."""

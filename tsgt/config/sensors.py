@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from tsgt.config.base import Model, Place, Positive, RelativePath
+from tsgt.config.base import Argument, Model, Place, Positive, RelativePath
 from tsgt.model import ImuNoise, ImuParameters, OdometryParameters, Row4, Vector3
 
 Ratio = Annotated[float, Field(gt=0, le=50)]
@@ -90,7 +90,7 @@ class ImuNoiseConfig(Model):
 class ImuConfig(Model):
     """IMU of the robot, read by a program."""
 
-    command: Annotated[tuple[str, ...], Field(min_length=1)]
+    command: Annotated[tuple[Argument, ...], Field(min_length=1)]
     """Program that reads the IMU, with its arguments; see the reference of its lines. An absolute path in the field."""
     name: str = "imu"
     """Name of the IMU's frame."""
@@ -165,7 +165,7 @@ def normal_gravity_mps2(latitude_deg: float, height_m: float) -> float:
 class OdometryConfig(Model):
     """Wheel odometry of the robot, read by a program; it is used with the IMU."""
 
-    command: Annotated[tuple[str, ...], Field(min_length=1)]
+    command: Annotated[tuple[Argument, ...], Field(min_length=1)]
     """Program that reads the odometry, with its arguments; see the reference of its lines. An absolute path in the field."""
     position_m: Place = (0.0, 0.0, 0.0)
     """Point of the robot whose speed the wheels tell, in the robot frame, [x, y, z]: the centre of the axle that does not steer; of

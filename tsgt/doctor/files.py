@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.config import (
     ClientConfig,
+    ImuMountingFile,
     MasterConfig,
     PrismLayoutFile,
     StationFramesFile,
@@ -28,7 +30,7 @@ from tsgt.radio.from_config import lora_settings
 from tsgt.radio.key_file import check_access, read_key
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from tsgt.config import ProtocolConfig
     from tsgt.doctor.finding import Finding
@@ -106,7 +108,7 @@ def check_setup(machine: Machine, config: MasterConfig) -> list[Finding]:
         _check_layout(config)
     except ConfigError as error:
         problem = error
-    files = {"station_frames": config.setup.station_frames, "prism_layout": config.setup.prism_layout}
+    files = dict(zip(_SETUP_FILES, config.setup_files, strict=False))  # the last one only if it is configured
     found = []
     if missing := missing_setup_files(config):
         problem = None
@@ -114,8 +116,7 @@ def check_setup(machine: Machine, config: MasterConfig) -> list[Finding]:
         found.append(failed("stations", str(problem)))
     for name, path in files.items():
         if path in missing:
-            command = "targets" if name == "station_frames" else "prisms"
-            text = f"{path} does not exist: the master runs without poses until `tsgt calibrate {command} ... --apply` writes it"
+            text = f"{path} does not exist: the master runs without poses until `{_SETUP_FILES[name].command} ... --apply` writes it"
             found.append(note(name, text))
         elif problem is not None and problem.path == path:
             found.append(failed(name, str(problem)))
@@ -146,14 +147,15 @@ def _check_layout(config: MasterConfig) -> None:
 def _check_setup_file(machine: Machine, name: str, path: Path) -> Finding:
     try:
         check_permissions(path)
-        quality = _frames_quality(path) if name == "station_frames" else _layout_quality(path)
+        quality = _SETUP_FILES[name].quality(path)
         head = path.read_text(encoding="utf-8").partition("\n")[0]
         written_ns = path.stat().st_mtime_ns
     except ConfigError as error:
         return failed(name, str(error))
-    command = "tsgt calibrate targets" if name == "station_frames" else "tsgt calibrate prisms"
     if "written by tsgt calibrate" not in head:
-        return note(name, f"{path}: not written by `{command}`; is it the example? {quality}")
+        return note(
+            name, f"{path}: not written by `{_SETUP_FILES[name].command}`; is it the example? {quality}"
+        )
     now_ns = machine.clock.realtime_ns()
     if now_ns < EARLIEST.timestamp() * 1e9 or written_ns > now_ns:
         return note(name, f"{path}: {quality}; its age is unknown, as this clock is wrong")
@@ -182,6 +184,36 @@ def _layout_quality(path: Path) -> str:
     sigmas_m = [max(entry.sigma_m) for entry in prisms.values() if entry.sigma_m is not None]
     text = f"prisms {', '.join(sorted(prisms, key=int))}"
     return f"{text}, one sigma up to {1e3 * max(sigmas_m):.1f} mm" if sigmas_m else text
+
+
+def _mounting_quality(path: Path) -> str:
+    covariance = load(path, ImuMountingFile).covariance
+    text = "mounting of the IMU"
+    if covariance is None:
+        return f"{text}, its uncertainty is unknown"
+    sigmas = {
+        name: math.sqrt(covariance.matrix[i][i])
+        for i, name in enumerate(covariance.components)
+        if covariance.matrix[i][i] > 0
+    }
+    position_m = max((sigmas.get(f"imu.{axis}", 0.0) for axis in "xyz"), default=0.0)
+    rotation_rad = max((sigmas.get(f"imu.rotation_{axis}", 0.0) for axis in "xyz"), default=0.0)
+    return f"{text}, one sigma up to {1e3 * position_m:.1f} mm and {math.degrees(rotation_rad):.2f} deg"
+
+
+class _SetupFile(NamedTuple):
+    command: str
+    """The command that writes it."""
+    quality: Callable[[Path], str]
+    """Reads it and says how good it is."""
+
+
+_SETUP_FILES = {
+    "station_frames": _SetupFile("tsgt calibrate targets", _frames_quality),
+    "prism_layout": _SetupFile("tsgt calibrate prisms", _layout_quality),
+    "imu_mounting": _SetupFile("tsgt calibrate imu", _mounting_quality),
+}
+"""In the order of ``MasterConfig.setup_files``."""
 
 
 def _age(age_ns: int) -> str:

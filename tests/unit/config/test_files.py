@@ -228,6 +228,29 @@ def test_path_with_a_zero_byte_is_rejected(key: str, tmp_path: Path) -> None:
         load(path, MasterConfig)
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new", "key"),
+    [
+        ("client", "spi_bus = 0", 'spi_bus = 0\ngpio_chip = "a\\u0000b"', "radio.wiring.gpio_chip"),
+        ("master", "[recording]", '[imu]\ncommand = ["a\\u0000b"]\n\n[recording]', "imu.command[#1]"),
+        (
+            "master",
+            "[recording]",
+            '[alarms]\nsite = "a"\ncommand = ["a", "a\\u0000b"]\n\n[recording]',
+            "alarms.command[#2]",
+        ),
+    ],
+)
+def test_name_with_a_zero_byte_is_rejected(name: str, old: str, new: str, key: str, tmp_path: Path) -> None:
+    """The kernel takes none."""
+    path = tmp_path / f"{name}.toml"
+    text = (EXAMPLES / f"{name}.example.toml").read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=rf"{re.escape(key)}: it cannot contain a zero byte"):
+        load_any(path)
+
+
 @pytest.mark.parametrize("kind", ["master", "client"])
 def test_path_of_a_socket_is_limited(kind: str, tmp_path: Path) -> None:
     """To what the kernel takes, counted in bytes."""

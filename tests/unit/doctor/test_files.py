@@ -63,6 +63,46 @@ async def test_world_writable_file_fails(tmp_path: Path, file: str, finding: str
     assert f"chmod o-w {tmp_path / file}" in found.detail
 
 
+MOUNTING = """\
+# written by tsgt calibrate imu
+kind = "imu_mounting"
+position_m = [0.21, -0.12, 0.43]
+orientation_xyzw = [0.0, 0.0, 0.0, 1.0]
+latency_ms = 4.3
+gyro_matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+[covariance]
+components = ["imu.x", "imu.rotation_z"]
+matrix = [[4e-6, 0.0], [0.0, 1e-6]]
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "outcome", "expected"),
+    [
+        (MOUNTING, 0o644, Outcome.OK, "one sigma up to 2.0 mm and 0.06 deg"),
+        (MOUNTING, 0o666, Outcome.FAILED, "chmod o-w"),
+        (MOUNTING.replace("latency_ms", "latency"), 0o644, Outcome.FAILED, "did you mean latency_ms?"),
+        (MOUNTING.partition("\n")[2], 0o644, Outcome.NOTE, "not written by `tsgt calibrate imu`"),
+        (None, 0o644, Outcome.FAILED, "no such file"),
+    ],
+)
+async def test_mounting_of_the_imu_is_a_set_up_file(
+    tmp_path: Path, text: str | None, mode: int, outcome: Outcome, expected: str
+) -> None:
+    """Poses depend on it as on the frames."""
+    fake = FakeMachine(tmp_path)
+    table = '[imu]\ncommand = ["imu-program"]\nmounting = "mounting.toml"\nlatitude_deg = 46.8\n\n'
+    fake.change("master.toml", "[[stations]]\nstation = 1", f"{table}[[stations]]\nstation = 1")
+    if text is not None:
+        (tmp_path / "mounting.toml").write_text(text)
+        (tmp_path / "mounting.toml").chmod(mode)
+        os.utime(tmp_path / "mounting.toml", ns=(NOW_NS - HOUR_NS, NOW_NS - HOUR_NS))
+    findings = await fake.run_checks("master.toml")
+    assert (findings["imu_mounting"].outcome, "stations" in findings) == (outcome, False)
+    assert expected in findings["imu_mounting"].detail
+
+
 async def test_missing_key_file_fails(tmp_path: Path) -> None:
     """The daemon would not start."""
     fake = FakeMachine(tmp_path)

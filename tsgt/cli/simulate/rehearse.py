@@ -105,7 +105,12 @@ def _debrief(day: Day, folder: Path, *, as_json: bool) -> int:
         click.echo(incident.text())
     for name, part in day.parts.items():
         click.echo(f"{name}: {part.text()}")
-    click.echo(f"files: {folder}, with a recording for each start of the master; next, for the longest one:")
     recordings = sorted((folder / "recordings").glob("*.jsonl"), key=lambda path: path.stat().st_size)
-    click.echo(f"    tsgt evaluate {recordings[-1]}")
+    if not recordings:  # ended before the master started
+        click.echo(f"files: {folder}, without a recording")
+    else:
+        click.echo(
+            f"files: {folder}, with a recording for each start of the master; next, for the longest one:"
+        )
+        click.echo(f"    tsgt evaluate {recordings[-1]}")
     return 0 if ok else CHECK_FAILED

@@ -74,6 +74,21 @@ async def _step(_day: Day, *_text: str, watch: Callable[[], None] = lambda: None
 
 
 @pytest.mark.usefixtures("short_temporary_folder")
+def test_rehearsal_that_ends_before_the_first_recording(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C at once: the debriefing has nothing to tell."""
+
+    async def ended(_day: Day, _incidents: object) -> None:
+        """Nothing was done."""
+
+    monkeypatch.setattr("tsgt.cli.simulate.rehearse.Site", _Site)
+    monkeypatch.setattr("tsgt.cli.simulate.rehearse.Watch", lambda *_arguments: _Watch([]))
+    monkeypatch.setattr(Day, "play", ended)
+    result = tsgt("rehearse", "--auto")
+    assert result.code == 0, result.err
+    assert result.out.endswith(", without a recording\n")
+
+
+@pytest.mark.usefixtures("short_temporary_folder")
 @pytest.mark.parametrize("incident", INCIDENTS)
 @pytest.mark.parametrize(("drive", "code"), [(GOOD, 0), (NO_POSE, 3)])
 def test_first_drive_is_judged_whatever_goes_wrong_later(

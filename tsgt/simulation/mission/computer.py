@@ -147,3 +147,31 @@ def _is_killed(error: BaseException) -> bool:
     if isinstance(error, BaseExceptionGroup):
         return all(map(_is_killed, error.exceptions))
     return isinstance(error, ProcessKilled)
+
+
+class ClientClock:
+    """The clock that a client is given; it remembers what the client knows, which reads the Unix time once per run.
+
+    Attributes
+    ----------
+    unix_at_zero_ns
+        Unix time at monotonic zero.
+    suspended_ns
+        For how long the computer had been suspended.
+    """
+
+    def __init__(self, computer: Computer) -> None:
+        self._computer, self._clock = computer, (clock := computer.clock)
+        self.monotonic_ns, self.sleep_until, self.true_ns = (
+            clock.monotonic_ns,
+            clock.sleep_until,
+            clock.true_ns,
+        )
+        self.unix_at_zero_ns = self.suspended_ns = 0
+
+    def realtime_ns(self) -> int:
+        """Return the Unix time."""
+        realtime_ns = self._clock.realtime_ns()
+        self.unix_at_zero_ns = realtime_ns - self._clock.monotonic_ns()
+        self.suspended_ns = self._computer.suspended_ns
+        return realtime_ns

@@ -27,7 +27,7 @@ from tsgt.simulation.kernel import DriftingClock, VirtualClock, drift_ramp
 from tsgt.simulation.lora import Air, TimestampJitter, radio_opener, scenario_link
 from tsgt.simulation.lora.adversary import ReplayAttacker
 from tsgt.simulation.mission.authors_node import AuthorsNode
-from tsgt.simulation.mission.computer import MASTER, Computer
+from tsgt.simulation.mission.computer import MASTER, ClientClock, Computer
 from tsgt.simulation.mission.config_edits import NO_EDIT, MasterEdit
 from tsgt.simulation.mission.daemon_configs import (
     STATUS_SOCKET,
@@ -78,33 +78,6 @@ _INTERFERER_POSITION_M = (30.0, -20.0, 1.5)
 _KEY_BYTES = 32
 _SHAKING_SEED = 0x5A
 _YEAR_NS = 365 * 86_400 * 10**9
-
-
-class _ClientClock:
-    """The clock that a client is given, with what the client knows of it, who reads the Unix time once per run.
-
-    Attributes
-    ----------
-    unix_at_zero_ns
-        Unix time at monotonic zero.
-    suspended_ns
-        For how long the computer had been suspended.
-    """
-
-    def __init__(self, computer: Computer) -> None:
-        self._computer, self._clock = computer, (clock := computer.clock)
-        self.monotonic_ns, self.sleep_until, self.true_ns = (
-            clock.monotonic_ns,
-            clock.sleep_until,
-            clock.true_ns,
-        )
-        self.unix_at_zero_ns = self.suspended_ns = 0
-
-    def realtime_ns(self) -> int:
-        realtime_ns = self._clock.realtime_ns()
-        self.unix_at_zero_ns = realtime_ns - self._clock.monotonic_ns()
-        self.suspended_ns = self._computer.suspended_ns
-        return realtime_ns
 
 
 class Mission:
@@ -388,7 +361,7 @@ class Mission:
     def _client(self, entry: SimulatedStation) -> Coroutine[None, None, None]:
         station, mistake = entry.station, self.mistakes.get(entry.station, NO_MISTAKE)
         station_log, computer = self.station_logs[station], self._computer(station)
-        clock = _ClientClock(computer)
+        clock = ClientClock(computer)
         folder = self._folder / station_name(station)
         if not mistake.delivers:  # what it measures is of no station of the mission
             folder, station_log = folder / "mistake", StationLog(station, None)

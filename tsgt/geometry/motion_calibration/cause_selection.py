@@ -133,7 +133,11 @@ class CauseSelection:
 
     def prior(self, chosen: frozenset[CauseHypothesis]) -> FloatArray:
         """(G, r) factor of the prior covariance of the errors with these causes."""
-        return np.concatenate([self._nominal, *(self._factor(each) for each in chosen)], axis=1)
+        return np.concatenate([self._nominal, *map(self._factor, self._in_order(chosen))], axis=1)
+
+    def _in_order(self, chosen: frozenset[CauseHypothesis]) -> list[CauseHypothesis]:
+        """Return causes in the order of the candidates: that of a set, and so the last digits, differ from run to run."""
+        return [each for each in self.candidates if each in chosen]
 
     def _factor(self, hypothesis: CauseHypothesis) -> FloatArray:
         factor = np.zeros((len(self._nominal), len(hypothesis.rows)))
@@ -143,7 +147,7 @@ class CauseSelection:
     def evidence(self, chosen: frozenset[CauseHypothesis]) -> float:
         """Log evidence of a set of causes, with its prior odds."""
         if chosen not in self._known:
-            odds = sum(each.log_odds - EVIDENCE_THRESHOLD for each in chosen)
+            odds = sum(each.log_odds - EVIDENCE_THRESHOLD for each in self._in_order(chosen))
             self._known[chosen] = self.information.evidence(self.prior(chosen)) + odds
         return self._known[chosen]
 
@@ -158,10 +162,11 @@ class CauseSelection:
 
     def _neighbours(self, chosen: frozenset[CauseHypothesis]) -> list[frozenset[CauseHypothesis]]:
         others = [each for each in self.candidates if each not in chosen]
-        neighbours = [chosen - {each} for each in chosen]
-        neighbours += [chosen - {old} | {new} for old in chosen for new in others]
+        known = self._in_order(chosen)
+        neighbours = [chosen - {each} for each in known]
+        neighbours += [chosen - {old} | {new} for old in known for new in others]
         # Two causes that one explained for a while.
-        neighbours += [chosen - set(pair) | {new} for pair in combinations(chosen, 2) for new in others]
+        neighbours += [chosen - set(pair) | {new} for pair in combinations(known, 2) for new in others]
         if len(chosen) < MAX_CAUSES:
             neighbours += [chosen | {each} for each in others]
         return neighbours or [chosen]
@@ -178,7 +183,7 @@ class CauseSelection:
         """Estimates and alternatives of the chosen causes, the most evident first."""
         mean, covariance = self.information.posterior(self.prior(chosen))
         found = []
-        for each in chosen:
+        for each in self._in_order(chosen):
             rows = np.array(each.rows, np.intp)
             rest = chosen - {each}
             gain = self.evidence(chosen) - self.evidence(rest) + EVIDENCE_THRESHOLD - each.log_odds

@@ -101,3 +101,12 @@ def test_what_cannot_be_told_apart_is_listed() -> None:
     (found,) = selection.summarise(selection.search())
     named = {found.hypothesis.cause, *(each.cause for each, _ in found.alternatives)}
     assert named == {SetupCause.LATENCY, SetupCause.RANGE_CONSTANT}
+
+
+def test_prior_has_the_order_of_the_candidates() -> None:
+    """The order of a set differs from run to run, and with it the last digits of what follows."""
+    selection = CauseSelection(information_of(np.zeros(len(NOMINAL)), precise()), NOMINAL, CANDIDATES)
+    width = selection.prior(frozenset()).shape[1]
+    alone = [selection.prior(frozenset({each}))[:, width:] for each in CANDIDATES]
+    together = selection.prior(frozenset(CANDIDATES))[:, width:]
+    np.testing.assert_array_equal(together, np.concatenate(alone, axis=1))

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-FIELD_DATA = Path(__file__).parents[2] / "shared" / "data" / "rts"
+TESTS = Path(__file__).parent
+FIELD_DATA = TESTS.parents[1] / "shared" / "data" / "rts"
 
 # No deadline: how long an example takes depends on the load of the machine.
 # Derandomised: the same examples in each run; `make fuzz` looks for new ones.
@@ -38,7 +39,7 @@ settings.load_profile("ci")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that run real processes or other people's programs as slow."""
     for item in items:
-        if item.path.parent.name in {"process", "interop"}:
+        if item.path.relative_to(TESTS).parts[0] in {"process", "interop"}:
             item.add_marker(pytest.mark.slow)
 
 
@@ -65,7 +66,7 @@ def _logging_as_before() -> Iterator[None]:
     structlog.reset_defaults()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def field_data() -> Path:
     """Folder of the real field data; a user's clone does not have it."""
     if not FIELD_DATA.is_dir():

@@ -29,10 +29,10 @@ def run_mission(
     protocol: ClassicMasterConfig | SuperframeMasterConfig = QUICK,
     **options: Any,
 ) -> MissionResult:
-    """Simulate half a minute of the reference scenario, or as given."""
+    """Simulate half a minute of the reference scenario, with the estimator ``linear``, or as given."""
     settings: dict[str, Any] = {"duration_s": 30.0, "protocol": protocol} | options
     folder.mkdir(parents=True, exist_ok=True)
-    return simulate(scenario or ScenarioConfig(), SimulationOptions(**settings), folder=folder, script=script)
+    return simulate(scenario or linear_drive(), SimulationOptions(**settings), folder=folder, script=script)
 
 
 def linear_drive() -> ScenarioConfig:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from itertools import combinations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
 from harness.files.authors_files import CONSTANTS
+from harness.files.cli import called
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from harness.files.cli import Tsgt
+
+    Evaluated = Callable[[str], tuple[dict[str, Any], Path]]
 
 
 class Expected(NamedTuple):
@@ -28,6 +33,7 @@ SEGMENTS = {
     ".": Expected({"1-2": 878.41, "1-3": 822.20, "2-3": 1037.22}, 1488, 2051),
     "segment2": Expected({"1-2": 878.11, "1-3": 824.70, "2-3": 1041.16}, 1503, 1927),
 }
+LINEAR = ("--estimator", "linear", "--no-held-out", "--json")
 STANDING_MM = {"1-2": 876.1, "1-3": 822.7, "2-3": 1035.4}  # SOURCE.md: 0.8761, 0.8227, 1.0354 m
 
 
@@ -49,8 +55,7 @@ def test_inter_prism_distances(
 ) -> None:
     """Mean distances at 20 Hz to a hundredth of a millimetre, with and without targets."""
     recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=targets)
-    options = ("--estimator", "linear", "--no-held-out", "--json")
-    result = tsgt("evaluate", recording, *options).json()
+    result = tsgt("evaluate", recording, *LINEAR).json()
     expected = SEGMENTS[segment]
     for pair, mean_mm in expected.mean_mm.items():
         figures = result["inter_prism_mm"][pair]
@@ -64,7 +69,7 @@ def test_inter_prism_distances(
 def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """Raw distances while stationary at the start of the first segment are those of SOURCE.md."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
-    result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
+    result = tsgt("evaluate", recording, *LINEAR).json()
     assert result["still_s"] > 20.0
     for pair, mean_mm in STANDING_MM.items():
         figures = result["inter_prism_static_mm"][pair]
@@ -77,7 +82,7 @@ def test_static_distances(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
 def test_second_segment_has_no_stationary_interval(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """It has no static distances."""
     recording = imported(tsgt, field_data, "segment2", tmp_path / "r.jsonl", targets=False)
-    result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
+    result = tsgt("evaluate", recording, *LINEAR).json()
     assert [p["valid"] for p in result["inter_prism_static_mm"].values()] == [0, 0, 0]
 
 
@@ -129,14 +134,27 @@ HELD_OUT = {
 }
 
 
+@pytest.fixture(scope="module")
+def evaluated(field_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Evaluated:
+    """Return a function that evaluates a segment with its targets, once, and draws the report of the first one."""
+
+    @cache
+    def evaluate(segment: str) -> tuple[dict[str, Any], Path]:
+        folder = tmp_path_factory.mktemp("segment")
+        recording = imported(called, field_data, segment, folder / "r.jsonl", targets=True)
+        report = ("--report", folder / "report") if segment == "." else ()
+        found = called("evaluate", recording, "--estimator", "continuous", *report, "--json")
+        assert found.code == 0, found.err
+        return found.json(), folder / "report"
+
+    return evaluate
+
+
 @pytest.mark.parametrize("segment", SEGMENTS)
 @pytest.mark.slow
-def test_held_out_errors_of_the_field_data(
-    tsgt: Tsgt, field_data: Path, tmp_path: Path, segment: str
-) -> None:
+def test_held_out_errors_of_the_field_data(evaluated: Evaluated, segment: str) -> None:
     """The continuous estimator predicts better than the linear one, far better in gaps."""
-    recording = imported(tsgt, field_data, segment, tmp_path / "r.jsonl", targets=True)
-    found = tsgt("evaluate", recording, "--estimator", "continuous", "--json").json()
+    found, _ = evaluated(segment)
     linear, continuous = found["held_out_mm"]["linear"], found["held_out_mm"]["continuous"]
     expected = HELD_OUT[segment]
     assert linear["mean"] == pytest.approx(expected.linear_mm, abs=0.01)
@@ -154,22 +172,21 @@ def test_held_out_errors_of_the_field_data(
 def test_robot_frame_keeps_the_layout(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """Reference distances are those of the authors' calibration_results.csv."""
     recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=False)
-    result = tsgt("evaluate", recording, "--no-held-out", "--json").json()
+    result = tsgt("evaluate", recording, *LINEAR).json()
     published = np.loadtxt(field_data / "20220314" / "calibration_results.csv")[:3] * 1e3
     for (a, b), distance_mm in zip(combinations((1, 2, 3), 2), published, strict=True):
         assert result["inter_prism_mm"][f"{a}-{b}"]["reference"] == pytest.approx(distance_mm, abs=1e-6)
 
 
 @pytest.mark.slow
-def test_report_of_the_field_data(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
+def test_report_of_the_field_data(evaluated: Evaluated) -> None:
     """With gaps and targets, without radio and timestamp bounds: all figures, nothing that is unknown as a number."""
     pytest.importorskip("matplotlib")
-    recording = imported(tsgt, field_data, ".", tmp_path / "r.jsonl", targets=True)
-    assert tsgt("evaluate", recording, "--report", tmp_path / "report").code == 0
-    drawn = {path.stem for path in (tmp_path / "report").glob("*.png")}
+    _, report = evaluated(".")
+    drawn = {path.stem for path in report.glob("*.png")}
     assert {"map", "trajectory", "held_out", "distances", "residuals", "calibration", "gaps"} <= drawn
     assert not drawn & {"radio", "clocks", "statuses", "reference_errors"}
-    page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
+    page = (report / "report.html").read_text(encoding="utf-8")
     text = re.sub(r"<style>.*?</style>|<[^>]*>", " ", page, flags=re.DOTALL)
     assert "accuracy of the clock synchronisation is unknown" in text
     assert not re.search(r"\b(nan|inf|None)\b", text)

@@ -185,7 +185,8 @@ def test_plan_and_simulation_agree(
     scenario.write_text('kind = "scenario"\n' + "".join(entries))
     spoken = ("--protocol", protocol)
     plan = tsgt("radio", "plan", *spoken, "--stations", stations, "--rate-hz", rate_hz, "--json").json()
-    found = tsgt("simulate", scenario, *spoken, "--duration", seconds, "--json").json()
+    options = ("--estimator", "linear", "--duration", seconds, "--json")
+    found = tsgt("simulate", scenario, *spoken, *options).json()
     duty = plan["duty_cycle"]
     assert found["airtime_fraction"] == pytest.approx(duty["master"] + stations * duty["station"], rel=0.03)
     each = found["stations"].values()

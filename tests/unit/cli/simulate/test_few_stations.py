@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from harness.files.cli import Tsgt
 
 LIMITS = {
-    1: (0.9, 10.0),
-    2: (0.9, 4.0),
-}  # least share of valid predicted poses, greatest rms at the centroid in mm
+    1: (60, 0.9, 10.0),
+    2: (30, 0.9, 4.0),
+}  # duration in s, least share of valid predicted poses, greatest rms at the centroid in mm
 
 
 @pytest.mark.slow
@@ -22,11 +22,11 @@ LIMITS = {
 def test_few_stations_from_mission_to_report(tsgt: Tsgt, tmp_path: Path, stations: int) -> None:
     """Live poses, processing, report: each command takes such a recording."""
     recording = tmp_path / "few.jsonl"
-    options = ("--stations", stations, "--imu", "industrial", "--duration", 60)
+    duration_s, valid, rms_mm = LIMITS[stations]
+    options = ("--stations", stations, "--imu", "industrial", "--duration", duration_s)
     outcome = tsgt("simulate", "dynamic", *options, "--output", recording, "--json")
     assert outcome.code == 0, outcome.err
     live = outcome.json()["live"]
-    valid, rms_mm = LIMITS[stations]
     assert live["predicted"]["valid_poses"] > valid * live["predicted"]["poses"]
     assert 0 < live["predicted_with_imu"]["poses"] <= live["predicted"]["poses"]
     assert live["smoothed"]["centroid"]["position_rms_mm"] < rms_mm

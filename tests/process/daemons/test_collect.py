@@ -114,7 +114,7 @@ def process(*arguments: str, **options: Any) -> Iterator[subprocess.Popen[bytes]
             started.kill()
 
 
-@pytest.fixture(params=["superframe", pytest.param("classic", marks=pytest.mark.slow)])
+@pytest.fixture(params=["superframe", "classic"])
 def folder(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
     """Return a folder with both configurations; channel, instrument and client run."""
     protocol = PROTOCOLS[request.param]

@@ -38,7 +38,6 @@ def program(make: str, path: Path) -> list[str]:
     return [sys.executable, "-m", "tsgt", "imu", make, str(path), "--rate-hz", "200"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("make", DEVICES)
 def test_device_becomes_records(make: str, tmp_path: Path) -> None:
     """Program, supervision and clock together: every sample once, with its duration and value."""
@@ -99,7 +98,6 @@ def test_program_ends_with_its_input(tmp_path: Path) -> None:
         running.stdout.close()
 
 
-@pytest.mark.slow
 def test_lost_device_is_named(tmp_path: Path) -> None:
     """One line that says which port, and exit code 1."""
     device = SimulatedVectorNav()

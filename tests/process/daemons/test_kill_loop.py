@@ -8,12 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.slow
 def test_random_kills_lose_nothing(tmp_path: Path) -> None:
     """After six or more kills of clients and master all journalled measurements arrive."""
     done = subprocess.run(

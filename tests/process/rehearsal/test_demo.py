@@ -127,11 +127,11 @@ def _end(demo: Demo) -> dict[str, object]:
     return result
 
 
-@pytest.mark.parametrize("protocol", ["superframe", pytest.param("classic", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("protocol", ["superframe", "classic"])
 def test_demo_streams_records_and_summarises(start: Start, folder: Path, protocol: str) -> None:
     """A reader gets live poses; the result has errors and the recording."""
     output = folder / "kept.jsonl"
-    demo = start("--protocol", protocol, "--duration", "20", "--output", str(output))
+    demo = start("--protocol", protocol, "--duration", "12", "--output", str(output))
     with demo.connect(folder / "poses.sock") as connection:
         lines = [json.loads(line) for line in connection.makefile()]
     result = _end(demo)
@@ -156,7 +156,7 @@ def test_demo_streams_records_and_summarises(start: Start, folder: Path, protoco
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    [signal.SIGINT, signal.SIGTERM],
     ids=lambda number: number.name,
 )
 def test_demo_ends_cleanly_on_a_signal(start: Start, folder: Path, number: signal.Signals) -> None:
@@ -240,7 +240,6 @@ def _journalled(folder: Path, station: int) -> dict[int, int]:
     }
 
 
-@pytest.mark.slow
 def test_killed_daemons_restart_without_loss(start: Start, folder: Path) -> None:
     """After SIGKILL of each daemon poses continue, and every journalled measurement is delivered."""
     demo = start("--duration", "120")

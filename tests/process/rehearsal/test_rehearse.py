@@ -8,11 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from harness.missions.processes import ROOT
 
 
-@pytest.mark.slow
 def test_day_is_played_from_start_to_end(tmp_path: Path) -> None:
     """Without a calibration, targets collected, frames applied while the master runs, a lost prism noticed, the debriefing."""
     command = ["rehearse", "--auto", "--incident", "prism", "--drive", "8", "--json"]

@@ -7,6 +7,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+import pytest
 from harness.files.damage import Damage, damages, examples
 from harness.instruments.leica import LeicaBench, leica_bench, leica_config
 from hypothesis import given
@@ -67,6 +68,7 @@ async def read_until(day: LeicaBench, until_s: float) -> None:
     begun=st.booleans(),
     checksum=st.booleans(),
 )
+@pytest.mark.slow
 def test_damaged_replies(
     script: list[Damage | None],
     begun: bool,  # noqa: FBT001 (given by hypothesis)

@@ -207,6 +207,7 @@ def text_of(values: tuple[int | float | str, ...]) -> str:
     ],
     checksum=False,
 )
+@pytest.mark.slow
 def test_reply_belongs_to_its_request(
     script: list[tuple[str, list[Fault], float]],
     checksum: bool,  # noqa: FBT001 (a parameter of hypothesis)

@@ -6,6 +6,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pytest
 from harness.files.pos_files import SECOND, Variant, write_pos
 from hypothesis import given
 from hypothesis import strategies as st
@@ -68,6 +69,7 @@ def test_written_files_are_read_exactly(
     st.integers(0, 30),
     st.text(st.sampled_from("0123456789.-/:, %\n\teE+abQ'\"é\u0660"), max_size=30),
 )
+@pytest.mark.slow
 def test_damaged_file_is_read_or_rejected(variant: Variant, start: int, length: int, put_in: str) -> None:
     """A file with overwritten characters; the error names the file."""
     with tempfile.TemporaryDirectory() as folder:

@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -31,6 +32,7 @@ def read(text: str | bytes) -> Reference:
 
 
 @given(stamps, st.data())
+@pytest.mark.slow
 def test_exported_trajectory_round_trips(stamps_ns: list[int], data: st.DataObject) -> None:
     """Times exactly, positions to the nanometre, orientations to 1e-12."""
     rows = [(data.draw(st.tuples(metres, metres, metres)), data.draw(parts)) for _ in stamps_ns]

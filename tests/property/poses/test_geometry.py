@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -97,6 +98,7 @@ def test_closed_form_is_optimal(layout: np.ndarray, points: np.ndarray) -> None:
 
 @deterministic
 @given(vectors(4.0), vectors(1e3), vectors(1.0, 3))
+@pytest.mark.slow
 def test_closed_form_is_equivariant(w: np.ndarray, t: np.ndarray, points: np.ndarray) -> None:
     """Transforming all measured points transforms the pose likewise."""
     layout = np.array([[0.4, 0.0, 0.0], [-0.3, 0.5, 0.1], [-0.2, -0.4, 0.3]])

@@ -119,6 +119,7 @@ def test_post_processing_equals_the_stream_with_two_stations_on_one_prism(
 
 @settings(max_examples=30)
 @given(arrivals(), st.lists(st.integers(START, START + 100 * 10**9), max_size=30))
+@pytest.mark.slow
 def test_timer_does_not_change_the_stream(measurements: list[PolarMeasurement], ticks_ns: list[int]) -> None:
     """Timer does not change the stream."""
     end_ns = max((m.received_ns for m in measurements), default=START)
@@ -127,6 +128,7 @@ def test_timer_does_not_change_the_stream(measurements: list[PolarMeasurement], 
 
 @settings(max_examples=10)
 @given(arrivals(CONTINUOUS), st.lists(st.integers(START, START + 10 * 10**9), max_size=30))
+@pytest.mark.slow
 def test_timer_does_not_change_predictions(measurements: list[PolarMeasurement], ticks_ns: list[int]) -> None:
     """Timer does not change predictions."""
     end_ns = START + 10 * 10**9

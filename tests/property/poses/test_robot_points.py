@@ -63,6 +63,7 @@ def test_velocity_and_acceleration_are_derivatives_of_the_position(state: States
 
 @deterministic
 @given(states, arms, covariances)
+@pytest.mark.slow
 def test_covariance_is_propagated_by_the_exact_jacobian(
     state: States, arm: np.ndarray, covariance: np.ndarray
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from harness.clocks.beacon_scenarios import BeaconScenario, run_beacon_scenario
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,6 +25,7 @@ from hypothesis import strategies as st
     frame_s=st.floats(0.3, 3),
     duration_s=st.sampled_from([5, 20, 60]),
 )
+@pytest.mark.slow
 def test_bound_contains_the_truth(
     seed: int,
     drift_ppm: float,

@@ -124,6 +124,7 @@ def test_station_survives_any_packet(events: list[tuple[bytes, int]]) -> None:
     turn=st.sampled_from(["poll", "shot", "order", "synchronisation"]),
     answers=st.lists(st.lists(st.tuples(packets, st.integers(54 * MS, 300 * MS)), max_size=3), max_size=60),
 )
+@pytest.mark.slow
 def test_every_transaction_ends(turn: str, answers: list[list[tuple[bytes, int]]]) -> None:
     """For any replies, a transaction sends a bounded number of requests, all to its own station."""
     turns: dict[str, Transaction] = {

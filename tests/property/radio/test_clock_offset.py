@@ -27,6 +27,7 @@ MS = 1_000_000
     cycles=st.integers(1, 50),
     loss=st.floats(0, 0.3),
 )
+@pytest.mark.slow
 def test_bound_contains_the_truth(
     name: str,
     seed: int,

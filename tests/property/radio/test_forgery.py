@@ -7,6 +7,7 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
+import pytest
 from harness.radio.forgery import KINDS, forge, state
 from harness.radio.scripted_stations import KEY, TIMING
 from harness.radio.superframe_loop import SuperframeLoop
@@ -43,6 +44,7 @@ def test_no_forged_packet_has_an_effect() -> None:
     assert (result.diverged, result.same_state) == (0, True)
 
 
+@pytest.mark.slow
 def test_missing_code_comparison_is_detected() -> None:
     """By acceptance, by packets and by the final state."""
     with patch("hmac.compare_digest", return_value=True):
@@ -173,6 +175,7 @@ class _Anybody:
         )
 
 
+@pytest.mark.slow
 def test_arbitrary_messages_raise_no_error() -> None:
     """Commands, sessions, numbers and times of any sender, all of which are accepted."""
     rng = np.random.default_rng(3)

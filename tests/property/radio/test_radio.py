@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import pytest
 from harness.files.damage import examples
 from harness.hardware.chips import Bench
 from harness.hardware.radios import PAPER, make_side, running_timeline
@@ -48,6 +49,7 @@ bus_actions = st.one_of(
 
 @examples(200)
 @given(actions=st.lists(bus_actions, min_size=5, max_size=40))
+@pytest.mark.slow
 def test_arbitrary_bus_traffic_never_breaks_the_chip(actions: list[tuple[str, object]]) -> None:
     """After any bus access and reset every register reads, and a reset restores a working chip."""
     timeline = VirtualTimeline()
@@ -195,6 +197,7 @@ air_actions = st.one_of(
 
 @examples(150)
 @given(actions=st.lists(air_actions, min_size=3, max_size=25))
+@pytest.mark.slow
 def test_arbitrary_packets_never_break_the_driver(actions: list[Sent | OwnPacket]) -> None:
     """After any packets, bursts and collisions the driver receives a valid one; all delivered packets were sent."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 from harness.files.damage import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -177,6 +178,7 @@ def _check_beacon(content: bytes) -> None:
 
 
 @given(beacons())
+@pytest.mark.slow
 def test_beacons_come_back(beacon: Beacon) -> None:
     """What is sent is what is understood."""
     assert decode_beacon(encode_beacon(beacon)) == beacon
@@ -192,6 +194,7 @@ def test_replies_come_back(reply: Reply) -> None:
 
 
 @given(beacons(), st.data())
+@pytest.mark.slow
 def test_every_damaged_beacon_is_refused_or_means_what_it_says(beacon: Beacon, data: st.DataObject) -> None:
     """Cut off anywhere, lengthened, or with a bit flipped: there is one form in bytes for each beacon."""
     content = encode_beacon(beacon)
@@ -204,6 +207,7 @@ def test_every_damaged_beacon_is_refused_or_means_what_it_says(beacon: Beacon, d
 
 @examples(50)
 @given(replies | plain_replies, st.data())
+@pytest.mark.slow
 def test_every_damaged_reply_is_refused_or_means_what_it_says(reply: Reply, data: st.DataObject) -> None:
     """Cut off anywhere, lengthened, or with a bit flipped: there is one form in bytes for each reply."""
     content = encode_reply(reply)

@@ -41,6 +41,7 @@ async def test_each_kind_of_instrument_is_made(example: str, kind: str) -> None:
     await instrument.close()
 
 
+@pytest.mark.slow
 def test_client_loads_no_heavy_libraries() -> None:
     """A station client starts without scipy, matplotlib and rich."""
     done = subprocess.run([sys.executable, "-c", CLIENT], capture_output=True, text=True, check=True)

@@ -89,6 +89,7 @@ def with_delays(
     return stream(scene.with_limits(smoothed_delays_ns=delays_ns), measurements, until_s)
 
 
+@pytest.mark.slow
 def test_poses_at_delays_leave_the_others_as_they_are(scene: Scene) -> None:
     """Predicted and final poses have the same bits, whatever delays there are."""
     measurements = every(scene, 8.0)
@@ -171,6 +172,7 @@ def test_poses_follow_the_robot(scene: Scene) -> None:
     assert off(scene, smoothed.select(late)) < (0.001, 0.001)
 
 
+@pytest.mark.slow
 def test_origin_of_the_layout_does_not_matter(scene: Scene) -> None:
     """With the origin metres off the prisms, the poses are those of another point of the robot."""
     arm = np.array([-3.0, 1.0, -1.5])
@@ -201,6 +203,7 @@ def test_predictions_use_earlier_measurements_only(scene: Scene) -> None:
     assert not same[~before].any()
 
 
+@pytest.mark.slow
 def test_late_measurement_within_the_lag_is_used(scene: Scene) -> None:
     """It fills its gap two seconds later."""
     measurements = every(scene, 9.0)
@@ -323,6 +326,7 @@ def test_tight_limit_makes_poses_uncertain(scene: Scene, name: str) -> None:
     assert Reason.UNCERTAIN in smoothed.reason[-8:]
 
 
+@pytest.mark.slow
 def test_position_limit_is_judged_at_the_reference_point(scene: Scene) -> None:
     """The uncertain rotation swings a point on a long lever arm about."""
     far = replace(
@@ -362,6 +366,7 @@ def test_robot_upside_down_is_invalid() -> None:
     assert smoothed.reason[-1] == Reason.TILT
 
 
+@pytest.mark.slow
 def test_noise_scale_is_applied(scene: Scene) -> None:
     """Twice the noise makes smoothed poses less certain."""
     plain = stream(scene, every(scene, 8.0), 8.0)[1]

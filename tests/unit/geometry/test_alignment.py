@@ -94,6 +94,7 @@ def test_covariance_matches_monte_carlo(weights: tuple[float, ...] | None) -> No
     np.testing.assert_allclose(sample, np.eye(6), atol=0.1)
 
 
+@pytest.mark.slow
 def test_covariance_from_residuals_is_unbiased() -> None:
     """Without covariances the noise is estimated from the residuals without bias, weights being inverse variances."""
     rng = np.random.default_rng(5)

@@ -112,6 +112,7 @@ def interpolated_track(items: Items) -> Results:
     ids=["measured", "interpolated", "three", "four", "nine"],
 )
 @pytest.mark.parametrize("split", ["one by one", "at random"])
+@pytest.mark.slow
 def test_batches_agree_bit_for_bit(compute: Callable[[Items], Results], split: str) -> None:
     """A thousand items at once, one by one, and in batches of random sizes give the same bits."""
     cuts = (

@@ -15,6 +15,7 @@ known_run = cache(run_beacon_scenario)
 
 
 @pytest.mark.parametrize("name", sorted(set(BY_NAME) - UNPREDICTABLE))
+@pytest.mark.slow
 def test_bound_contains_the_truth(name: str) -> None:
     """Every reported time is within its bound."""
     for seed in range(3):
@@ -24,6 +25,7 @@ def test_bound_contains_the_truth(name: str) -> None:
 @pytest.mark.parametrize(
     "name", ["usual", "loss", "outage", "long-outage", "steps", "exact", "late", "delayed", "slewed"]
 )
+@pytest.mark.slow
 def test_live_times_are_accurate_to_microseconds(name: str) -> None:
     """Including rounding to 16 us: p50 at most 11 us, p99 at most 40 us."""
     for seed in range(3):
@@ -32,6 +34,7 @@ def test_live_times_are_accurate_to_microseconds(name: str) -> None:
         assert run.quantile_us(0.99, live=True, since_s=CONVERGED_S) < (75 if name == "slewed" else 40)
 
 
+@pytest.mark.slow
 def test_outage_is_smoothed_from_both_sides() -> None:
     """Times within 60 s without a beacon are accurate to 75 us."""
     for seed in range(5):

@@ -27,6 +27,7 @@ def test_there_are_two_hundred_scripts() -> None:
 
 
 @pytest.mark.parametrize("kind", ["connection lost"])
+@pytest.mark.slow
 def test_fault_of_the_network_is_survived(kind: str) -> None:
     """Every reading was offered, once, at its time within three sigmas; and measuring continues in time."""
     outcome = run_network_script(FIRST[kind])

@@ -74,6 +74,7 @@ def stamp_errors_ms(measurements: list[PolarMeasurement]) -> list[float]:
 @pytest.mark.parametrize(
     ("authors", "rate_hz", "error_ms"), [(False, 1.6, 0.5), (True, 1.5, 4.0)], ids=["ours", "authors'"]
 )
+@pytest.mark.slow
 async def test_poses_are_correct(tmp_path: Path, *, authors: bool, rate_hz: float, error_ms: float) -> None:
     """Stations with wrong clocks are commanded to track, synchronised and polled; stamps and poses are correct."""
     async with field_of(tmp_path, DRIVING, authors=authors) as field, running(field.master()):
@@ -245,6 +246,7 @@ async def test_master_that_is_stopped_as_its_computer_resumes_ends(tmp_path: Pat
     assert task.cancelled()
 
 
+@pytest.mark.slow
 async def test_suspended_master_begins_anew(tmp_path: Path) -> None:
     """Its clock stood still: nothing more is published on the old timeline, an event says why, stations join the new session."""
     suspended_ns = 0
@@ -271,6 +273,7 @@ async def test_suspended_master_begins_anew(tmp_path: Path) -> None:
 UNCALIBRATED = replace(DRIVING.parameters, prisms=(), no_poses="not calibrated")
 
 
+@pytest.mark.slow
 async def test_uncalibrated_master_takes_a_calibration_while_it_runs(tmp_path: Path) -> None:
     """Until then it records raw measurements, and says why there are no poses; a replay gives the same lines."""
     async with (
@@ -447,6 +450,7 @@ async def test_master_stops_within_a_second_and_restarts(tmp_path: Path, at_ms: 
         assert len(list((tmp_path / "recordings").iterdir())) == 2
 
 
+@pytest.mark.slow
 async def test_failed_radio_is_reopened(tmp_path: Path) -> None:
     """One event reports the failure, status records continue, and poses recover."""
     async with field_of(tmp_path) as field:

@@ -122,6 +122,7 @@ def motion(
     tilt_rad=st.floats(-0.4, 0.4),
     lost=st.sampled_from([(2,), (2, 3), (1, 2)]),
 )
+@pytest.mark.slow
 def test_prism_is_within_the_spread(
     speed_mps: float, yaw_rate_radps: float, heading_rad: float, tilt_rad: float, lost: tuple[int, ...]
 ) -> None:
@@ -136,6 +137,7 @@ def test_prism_is_within_the_spread(
     assert towards.spread_rad < math.asin((1.0 + 0.5 + 1.1 * speed_mps + 0.5) / 40.0)
 
 
+@pytest.mark.slow
 def test_prism_is_within_the_spread_in_the_reference_scenario() -> None:
     """The robot starts, stops and turns: always when the command is given, mostly when the telescope arrives."""
     world = scenario_world(ScenarioConfig(), 600.0, np.random.default_rng(0))

@@ -158,6 +158,7 @@ async def test_speed_changes_the_pace_only(tmp_path: Path, speed: float, lasts_s
     assert (ended_ns - began_ns) / 1e9 == pytest.approx(lasts_s, abs=0.2)
 
 
+@pytest.mark.slow
 async def test_reader_tells_the_delays_apart(tmp_path: Path) -> None:
     """Each epoch has one pose of each series, and each arrives when its delay has passed, before the next prediction."""
     path = tmp_path / "run.jsonl"

@@ -229,6 +229,7 @@ async def test_measurement_is_delivered_after_the_disk_accepts_or_refuses_it(
         await air.frames(1.0)
 
 
+@pytest.mark.slow
 async def test_journal_has_receptions_and_acknowledgements(tmp_path: Path) -> None:
     """A restart needs them."""
     async with superframe_day(tmp_path) as (day, air):
@@ -241,6 +242,7 @@ async def test_journal_has_receptions_and_acknowledgements(tmp_path: Path) -> No
     assert 3 <= types.count("acknowledged") <= 6
 
 
+@pytest.mark.slow
 async def test_status_reports_delivery(tmp_path: Path) -> None:
     """Before and after a master is there."""
     async with superframe_day(tmp_path) as (day, air):

@@ -247,6 +247,7 @@ def run_responses(random: np.random.Generator, rate_ppm: float, spread_ms: float
     spread_ms=st.floats(0.1, 100),
     period_ms=st.sampled_from([50, 400, 1000]),
 )
+@pytest.mark.slow
 def test_times_are_in_order_and_never_after_the_arrival(
     seed: int, rate_ppm: float, spread_ms: float, period_ms: int
 ) -> None:

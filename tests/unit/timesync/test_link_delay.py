@@ -30,6 +30,7 @@ def test_initial_estimate_is_nominal() -> None:
 
 
 @pytest.mark.parametrize(("exchanges", "p99_us", "bound_us"), [(8, 22, 100), (64, 8, 25), (256, 5, 15)])
+@pytest.mark.slow
 def test_error_falls_with_the_number_of_exchanges(exchanges: int, p99_us: float, bound_us: float) -> None:
     """With 20 us of jitter on each timestamp: 20 us after 8 exchanges, 7 us after 64."""
     trips = [measured(NOMINAL_NS + 150_000, exchanges, seed=seed)[0] for seed in range(100)]

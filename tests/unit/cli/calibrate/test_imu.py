@@ -67,6 +67,7 @@ def test_file_and_json_hold_the_mounting(
     ]
 
 
+@pytest.mark.slow
 def test_table_and_notes(tsgt: Tsgt, recording: Path) -> None:
     """Values stand beside their sigmas and what was configured."""
     done = tsgt("calibrate", "imu", recording)

@@ -45,6 +45,7 @@ def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_exact_measurements_need_no_correction(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
     """Corrections are far below a millimetre, and the file agrees with the JSON output."""
     output = tmp_path / "frames.toml"
@@ -90,6 +91,7 @@ def test_result_is_independent_of_the_robot_origin(recording: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
     """Without --json the output is a table."""
     done = tsgt(

@@ -114,6 +114,7 @@ def test_reference_of_the_robot_is_carried_over(
     assert rotation_deg == pytest.approx(ours["orientation_rms_deg"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_point_of_a_reference_without_comments_can_be_given(tsgt: Tsgt, recording: Path) -> None:
     """As of a trajectory that another program wrote for its sensor."""
     stated, bare = recording.with_name("stated.tum"), recording.with_name("bare.tum")

@@ -87,6 +87,7 @@ def test_suffix_jsonl_selects_a_recording_of_poses(tsgt: Tsgt, recording: Path) 
     assert "motion" not in result
 
 
+@pytest.mark.slow
 def test_tuned_motion_prior_is_recorded(tsgt: Tsgt, recording: Path) -> None:
     """The poses are recorded with the parameters that they were computed with, which are also printed."""
     output = recording.with_name("poses.jsonl")
@@ -165,6 +166,7 @@ def test_frames_for_points_are_rejected(tsgt: Tsgt, tmp_path: Path) -> None:
     assert not (tmp_path / "poses.tum").exists()
 
 
+@pytest.mark.slow
 def test_evaluate_agrees_for_points_and_raw_measurements(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
     """The conversion to raw measurements and back changes no distance."""
     points = tmp_path / "points.jsonl"

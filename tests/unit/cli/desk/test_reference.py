@@ -23,6 +23,7 @@ def recording(tsgt: Tsgt, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_alignment_agrees_with_evo(
     tsgt: Tsgt, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,6 +115,7 @@ def test_stale_socket_is_one_line(tsgt: Tsgt, tmp_path: Path) -> None:
     assert "Connection refused" in outcome.err
 
 
+@pytest.mark.slow
 def test_listening_needs_neither_numpy_nor_scipy() -> None:
     """The command starts fast on a small computer."""
     check = "import sys, tsgt.cli.live.listen; sys.exit(bool({'numpy', 'scipy'} & sys.modules.keys()))"

@@ -16,6 +16,7 @@ SUPERFRAME = ("radio", "plan", "--protocol", "superframe", "--stations")
 CLASSIC = ("radio", "plan", "--protocol", "classic", "--stations")
 
 
+@pytest.mark.slow
 def test_plan_as_json(tsgt: Tsgt) -> None:
     """The output has all figures, for the given settings and for the table of others."""
     outcome = tsgt(*SUPERFRAME, 3, "--table", "--json")
@@ -45,6 +46,7 @@ def test_plan_as_text(tsgt: Tsgt) -> None:
     assert sum(line.startswith("SF ") for line in lines) == 24
 
 
+@pytest.mark.slow
 def test_link_margin_is_power_minus_loss_minus_sensitivity(tsgt: Tsgt) -> None:
     """1 km of free space is 91.6 dB at 905 MHz; SF 9 at 250 kHz needs -126 dBm."""
     arguments = ("--power-dbm", 14, "--antenna-gain-dbi", 0, "--path-loss-exponent", 2, "--distance-m", 1000)
@@ -71,6 +73,7 @@ def test_insufficient_capacity_is_a_warning(tsgt: Tsgt) -> None:
     ("region", "frequency_mhz", "bandwidth_khz", "power_dbm"),
     [("EU868", 869.85, 250, 7), ("US915", 905.0, 500, 17), ("CA915", 905.0, 500, 17)],
 )
+@pytest.mark.slow
 def test_region_selects_a_legal_channel(
     tsgt: Tsgt, region: str, frequency_mhz: float, bandwidth_khz: float, power_dbm: int
 ) -> None:
@@ -95,6 +98,7 @@ def test_region_selects_a_legal_channel(
         (("EU433",), "above 0 dBm e.r.p.", "antenna_gain_dbi = 0.1 by an attenuator of 2.0 dB"),
     ],
 )
+@pytest.mark.slow
 def test_violation_ends_with_the_remedy(
     tsgt: Tsgt, arguments: tuple[object, ...], exceeded: str, remedy: str
 ) -> None:

@@ -25,6 +25,7 @@ START_S = START_UNIX_NS / 1e9
 CLASSIC = ("--protocol", "classic")
 
 
+@pytest.mark.slow
 def test_json_has_the_documented_keys(tsgt: Tsgt) -> None:
     """Classic."""
     found = tsgt("simulate", "dynamic", *CLASSIC, "--stations", 1, "--duration", 20, "--json").json()
@@ -66,6 +67,7 @@ def test_json_has_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
     assert outage["live_age_ms"]["p50"] > 0
 
 
+@pytest.mark.slow
 def test_simulate_as_text(tsgt: Tsgt) -> None:
     """The text has a line per station and the number of violations."""
     result = tsgt("simulate", *CLASSIC, "--stations", 1, "--duration", 16)
@@ -74,6 +76,7 @@ def test_simulate_as_text(tsgt: Tsgt) -> None:
     assert "violations   0" in result.out
 
 
+@pytest.mark.slow
 def test_recording_and_truth_are_written(tsgt: Tsgt, tmp_path: Path) -> None:
     """The recording can be processed, and the truth covers all its epochs."""
     recording, truth = tmp_path / "run.jsonl", tmp_path / "truth.tum"
@@ -185,6 +188,7 @@ def test_missing_folder_is_rejected_before_the_mission(tsgt: Tsgt, tmp_path: Pat
     assert "no such folder" in result.err
 
 
+@pytest.mark.slow
 def test_mission_without_poses_has_dashes(tsgt: Tsgt) -> None:
     """The first synchronisation takes longer than the mission."""
     result = tsgt("simulate", *CLASSIC, "--duration", "3")
@@ -220,6 +224,7 @@ def test_unknown_scenario_is_rejected(tsgt: Tsgt) -> None:
     assert "no such scenario; there are dynamic, quarry" in result.err
 
 
+@pytest.mark.slow
 def test_violations_give_exit_code_3(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
     """Violations are listed up to a limit."""
     planted = [Violation("time", f"planted {number}") for number in range(25)]

@@ -148,6 +148,7 @@ def test_evidence_gradient_agrees_with_differences(observations: Observations, *
         assert gradient[i] == pytest.approx((up - down) / (2 * step), rel=0.05, abs=0.5)
 
 
+@pytest.mark.slow
 def test_average_information_is_close_to_the_curvature(observations: Observations) -> None:
     """Central differences of the gradient; the rest is chance."""
     segment = hyperparameters._Segment(observations.select(slice(0, 300)))

@@ -281,6 +281,7 @@ def test_start_that_fails_after_the_window_has_moved_on() -> None:
     assert len(live.window.residuals_m) == len(live.window.observations)
 
 
+@pytest.mark.slow
 def test_no_start_when_all_of_the_window_is_wrong() -> None:
     """After an outage the only measurement is of a wrong prism: what came before it tells a trajectory, but none till now."""
     observations = measurements()

@@ -28,6 +28,7 @@ def found(drive: UncalibratedDrive) -> ImuCalibration:
     return calibrate_imu(drive.observations, drive.samples, drive.imu.noise, drive.gravity)
 
 
+@pytest.mark.slow
 def test_setup_is_found_within_its_sigmas(drive: UncalibratedDrive, found: ImuCalibration) -> None:
     """Every component of the error is within four of its sigmas, and their squares are those of a chi-square."""
     error = found.setup.local_coordinates_about(drive.truth)

@@ -112,6 +112,7 @@ def test_mounting_one_degree_off(axis: int) -> None:
 
 
 @pytest.mark.parametrize("axis", EACH_AXIS)
+@pytest.mark.slow
 def test_lever_arm_100_mm_off(axis: int) -> None:
     """A decimetre along any axis is named with its size."""
     right = drive()
@@ -174,6 +175,7 @@ def test_robot_at_rest_tells_nothing() -> None:
 
 
 @pytest.mark.parametrize("grade", ["industrial", pytest.param("consumer", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_right_setup_is_not_reported(grade: str) -> None:
     """No false alarm; what harms is ruled out."""
     check = drive(grade).check()
@@ -190,6 +192,7 @@ def test_one_prism_alone_is_not_another_robot() -> None:
     assert check.confirmed
 
 
+@pytest.mark.slow
 def test_robot_that_rolls_over_has_the_same_imu() -> None:
     """Its prisms are hidden as soon as it has rolled by 45 degrees, and seen again when it stands: they do not tell the fast turn."""
     sound = drive()
@@ -225,6 +228,7 @@ def test_no_false_alarm_on_clean_drives(grade: str) -> None:
         lambda time_s: np.isin(np.arange(len(time_s)), (3, 2000)),
     ],
 )
+@pytest.mark.slow
 def test_few_samples_tell_nothing(held: Callable[[FloatArray], NDArray[np.bool_]]) -> None:
     """Silences of the IMU are no error of its set-up."""
     right = drive()

@@ -113,6 +113,7 @@ def test_wander_is_estimated_and_included() -> None:
     assert 6.2 < np.mean(distances) < 25.5
 
 
+@pytest.mark.slow
 def test_no_wander_in_white_noise() -> None:
     """Less than half a millisecond is found in white noise."""
     assert calibrate_motion(drive(), REFINE, prior=MOTION_PRIOR, noise_scale=1.0).wander_s < 5e-4
@@ -142,6 +143,7 @@ def test_levelled_stations_have_four_degrees_of_freedom() -> None:
     assert np.all(np.diag(level.covariance)[at] < 1.05 * np.diag(free.covariance)[at])
 
 
+@pytest.mark.slow
 def test_frames_without_initial_frames() -> None:
     """Initial frames are good to decimetres, final ones within their covariance."""
     observations = with_errors(drive())

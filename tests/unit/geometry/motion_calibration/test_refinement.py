@@ -101,6 +101,7 @@ def test_turned_tripod_is_found() -> None:
     assert np.abs(missed_m).max() < 4e-3
 
 
+@pytest.mark.slow
 def test_latency_is_found() -> None:
     """Station 2 stamps 25 ms late."""
     observations = drive(60.0, seed=4)

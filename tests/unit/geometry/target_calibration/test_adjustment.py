@@ -102,6 +102,7 @@ def test_wrong_target_constant_is_found() -> None:
 
 
 @pytest.mark.parametrize("station", [0, 1])
+@pytest.mark.slow
 def test_two_far_targets_are_found_together(station: int) -> None:
     """Two targets at 260 to 290 m, 15 mm off each in different directions, at one station."""
     displaced = {(station, 0): SIDEWAYS, (station, 1): np.array([-0.009, 0.003, 0.012])}
@@ -125,6 +126,7 @@ def test_gross_errors_do_not_spoil_the_start() -> None:
     assert sights(solved) == {(1, 0), (2, 3)}
 
 
+@pytest.mark.slow
 def test_index_error_and_far_targets_are_told_apart() -> None:
     """Both are found when both are there."""
     displaced = {(1, 0): SIDEWAYS, (1, 1): np.array([-0.009, 0.003, 0.012])}
@@ -181,6 +183,7 @@ def test_checks_are_those_of_the_weighted_solution() -> None:
 
 
 @pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.slow
 def test_frame_nees_is_consistent(*, weighted: bool) -> None:
     """With instrument errors within the data sheet the normalised errors of the frames average one."""
     total = freedom = 0.0

@@ -286,6 +286,7 @@ def measured_robot(rng: np.random.Generator, bad_m: float = 0.0) -> tuple[PointS
     return sets[0], PointSet(sets[0].names, BODY, cad_noise), sets[1]
 
 
+@pytest.mark.slow
 def test_prism_nees_is_consistent() -> None:
     """The normalised squared errors of the prisms average their three degrees of freedom."""
     rng = np.random.default_rng(1)

@@ -43,6 +43,7 @@ def test_small_displacement_is_not_decided() -> None:
 
 
 @pytest.mark.parametrize("station", [0, 2])
+@pytest.mark.slow
 def test_displacement_agrees_with_the_truth_within_its_covariance(station: int) -> None:
     """Normalised errors average one per component, also of the reference station."""
     squares = []

@@ -54,6 +54,7 @@ def run_smoother(observations: Observations, *, lag_s: float = LAG_S) -> FixedLa
     return window
 
 
+@pytest.mark.slow
 def test_newest_state_agrees_with_batch(observations: Observations) -> None:
     """Marginalisation keeps the information: state and covariance at the end are those of all measurements."""
     at_s = np.array([observations.time_s[-1] + 0.3])
@@ -64,6 +65,7 @@ def test_newest_state_agrees_with_batch(observations: Observations) -> None:
     np.testing.assert_allclose(covariance, expected_covariance, rtol=0.05, atol=1e-3 * sigmas.max() ** 2)
 
 
+@pytest.mark.slow
 def test_smoothed_state_agrees_with_batch(observations: Observations) -> None:
     """A few seconds of later measurements are as good as all."""
     window = FixedLagSmoother(PRIOR)
@@ -81,6 +83,7 @@ def test_smoothed_state_agrees_with_batch(observations: Observations) -> None:
         window.marginalise_before(now_s - LAG_S)
 
 
+@pytest.mark.slow
 def test_the_window_does_not_grow(observations: Observations) -> None:
     """The number of measurements in the window is bounded."""
     window = run_smoother(observations)
@@ -89,6 +92,7 @@ def test_the_window_does_not_grow(observations: Observations) -> None:
     assert window.horizon_s > observations.time_s[-1] - 1.5 * LAG_S
 
 
+@pytest.mark.slow
 def test_late_measurement_within_the_lag_counts(observations: Observations) -> None:
     """Within the lag the order of arrival does not matter."""
     order = np.arange(len(observations))
@@ -120,6 +124,7 @@ def test_initialisation_needs_three_prisms(observations: Observations) -> None:
 
 
 @pytest.mark.parametrize("off_m", [0.2, 1.0, 30.0])
+@pytest.mark.slow
 def test_single_outlier_is_rejected(observations: Observations, off_m: float) -> None:
     """One wrong distance moves the trajectory by less than its sigmas."""
     row = len(observations) - 12

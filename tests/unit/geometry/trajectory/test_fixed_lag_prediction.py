@@ -49,6 +49,7 @@ def covariance_without_nis_scale(window: FixedLagSmoother, at_s: float) -> Float
     return Propagator(state, covariance[0], PRIOR, process_noise_scale=PREDICTION_NOISE_SCALE).at(at_s)[1]
 
 
+@pytest.mark.slow
 def test_large_innovations_increase_predicted_covariance(observations: Observations) -> None:
     """The robot doubles its speed between measurements."""
     hurried_s = np.where(
@@ -66,6 +67,7 @@ def test_large_innovations_increase_predicted_covariance(observations: Observati
     assert ratios[1] > 2.0
 
 
+@pytest.mark.slow
 def test_outlier_leaves_predicted_covariance_unchanged(observations: Observations) -> None:
     """A rejected measurement says nothing about the motion."""
     row = len(observations) - 3

@@ -154,6 +154,7 @@ def test_translation_agrees_with_dense_regression() -> None:
     assert evidence[1] - evidence[0] == pytest.approx(expected_evidence[1] - expected_evidence[0], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_pose_agrees_with_scipy_least_squares(observations: Observations) -> None:
     """On polar measurements of a rotating robot the states are those of scipy's least squares on the angles themselves."""
     data = observations.select(observations.time_s < 1.0)

@@ -96,6 +96,7 @@ def seen_at(points: FloatArray) -> tuple[Observations, States]:
 
 @settings(derandomize=True, max_examples=40)
 @given(st.integers(0, 10**6))
+@pytest.mark.slow
 def test_jacobian_is_exact(seed: int) -> None:
     """For random attitudes, frames, time offsets and residuals the Jacobian equals central differences."""
     rng = np.random.default_rng(seed)

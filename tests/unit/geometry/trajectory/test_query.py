@@ -257,6 +257,7 @@ def nees_of(error: FloatArray, covariance: FloatArray) -> FloatArray:
 @pytest.mark.parametrize(
     ("what", "freedom"), [("knots", 6), ("pose", 6), ("state", 18), ("ahead", 6), ("ahead_state", 18)]
 )
+@pytest.mark.slow
 def test_nees_is_consistent(nees_by_kind: dict[str, FloatArray], what: str, freedom: int) -> None:
     """Over 100 robots drawn from the prior, mean NEES lies in its 95 % band at each time."""
     nees = nees_by_kind[what]

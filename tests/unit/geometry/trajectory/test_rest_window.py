@@ -54,6 +54,7 @@ def sigma_m(window: FixedLagSmoother, at_s: float, *, rest: bool) -> float:
     return float(np.sqrt(LINE_OF_SIGHT @ covariance[:2, :2] @ LINE_OF_SIGHT))
 
 
+@pytest.mark.slow
 def test_measurements_of_a_stop_determine_one_pose() -> None:
     """Errors and stated sigmas fall to less than half."""
     window, found = followed(measure_along(creeping(0.0), until_s=11.0, seed=1))

@@ -89,6 +89,7 @@ def test_concatenated_states_are_the_whole() -> None:
 
 @settings(derandomize=True, max_examples=30)
 @given(st.integers(0, 10**6))
+@pytest.mark.slow
 def test_process_jacobians_are_exact(seed: int) -> None:
     """For random states, by both knots, they equal central differences."""
     knots = wild_knots(seed)

@@ -216,6 +216,7 @@ def test_distance_zero_is_none() -> None:
         max_size=12,
     )
 )
+@pytest.mark.slow
 def test_any_message_gives_valid_instants(answers: list[bytes | None]) -> None:
     """Any 34 bytes, with synchronisations at any time."""
     master = Master()

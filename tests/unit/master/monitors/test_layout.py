@@ -174,6 +174,7 @@ def test_no_false_alarm_on_the_reference_scenario(rate_hz: float) -> None:
 
 
 @pytest.mark.parametrize("segment", [".", "segment2"])
+@pytest.mark.slow
 def test_no_false_alarm_on_the_published_drives(field_data: Path, segment: str) -> None:
     """Both drives of 14 March 2022, with the prism layout of the authors."""
     folder = field_data / "20220314"

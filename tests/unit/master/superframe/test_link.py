@@ -200,6 +200,7 @@ async def test_unwritten_measurements_are_not_acknowledged(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("full_s", [4.7, 4.8, 4.9])
+@pytest.mark.slow
 async def test_lost_line_does_not_repeat_a_measurement(tmp_path: Path, full_s: float) -> None:
     """A disk that stays full loses the oldest lines; a measurement that it keeps is written once, whatever preceded it."""
     write_line, publish = RecordingWriter.write_line, Publisher.measurement
@@ -482,6 +483,7 @@ async def test_station_in_direct_mode_gets_no_search_command(tmp_path: Path) -> 
         assert "station_not_tracking 1" in events(field)
 
 
+@pytest.mark.slow
 async def test_refused_search_is_no_refusal_to_track(tmp_path: Path) -> None:
     """It is repeated after 5 s, without an event."""
     async with field_of(tmp_path, superframe=True) as field, running(field.master()):
@@ -530,6 +532,7 @@ class _Seventies:
         return TRUE.monotonic_ns() - 30 * SECOND
 
 
+@pytest.mark.slow
 async def test_measurements_from_before_1970_are_kept(tmp_path: Path) -> None:
     """A master without a battery clock: recordings have no negative times, so the bound covers the difference."""
     async with field_of(tmp_path, superframe=True) as field:

@@ -136,6 +136,7 @@ def test_compliant_use_changes_little(region: str, settings: dict[str, int], cha
     gain_dbi=st.floats(-40, 40),
     duty=st.floats(0, 1),
 )
+@pytest.mark.slow
 def test_compliant_use_has_no_violations(
     *, region: str, bandwidth_hz: int, power_dbm: int, gain_dbi: float, duty: float
 ) -> None:

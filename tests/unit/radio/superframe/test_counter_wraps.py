@@ -63,6 +63,7 @@ def test_session_time_wraps_after_12_days() -> None:
 
 
 @pytest.mark.parametrize("gone_ns", [4_000 * MS, 15_000 * MS, 30_000 * MS])
+@pytest.mark.slow
 def test_backlog_from_before_the_wrap_arrives_after_it(gone_ns: int) -> None:
     """A station without radio contact across the wrap delivers what it measured on both sides of it."""
     loop = loop_before_wrap()
@@ -94,6 +95,7 @@ def test_new_session_when_the_frame_counter_runs_out() -> None:
     assert_sound(loop)
 
 
+@pytest.mark.slow
 def test_low_bits_of_numbers_and_frames_wrap() -> None:
     """Sequence numbers and frames have 8 bits on air; 600 of each arrive, with an outage of more than 128 measurements."""
     loop = SuperframeLoop(TIMING, Authenticator(KEY), Random(1).getrandbits)  # noqa: S311 (a test has no secrets)

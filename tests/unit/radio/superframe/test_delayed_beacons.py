@@ -106,6 +106,7 @@ def test_delay_below_a_millisecond_shifts_timestamps(late_ns: int) -> None:
 
 
 @pytest.mark.parametrize("step_ns", [1_000, 10_000, 25_000])
+@pytest.mark.slow
 def test_growing_delay_is_detected(step_ns: int) -> None:
     """It resembles skew; timestamps exceed their bounds by at most half a millisecond."""
     loop = running_loop(60)
@@ -221,6 +222,7 @@ def test_replayed_missed_beacons_are_rejected(late_s: int) -> None:
     )
 
 
+@pytest.mark.slow
 def test_replayed_session_is_never_confirmed() -> None:
     """Nothing is deleted, no command executed, and the real master is joined at once."""
     yesterday = SuperframeLoop(TIMING, Authenticator(KEY), Random(2).getrandbits, start_ns=1000 * MS)  # noqa: S311 (as above)
@@ -308,6 +310,7 @@ def test_equally_delayed_first_beacons_give_no_backlog_timestamps(
 
 
 @pytest.mark.parametrize(("late_ms", "which"), [(2, [1, 2]), (3, [3, 4]), (5, [3])])
+@pytest.mark.slow
 def test_untimeable_oldest_measurements_are_discarded(late_ms: int, which: list[int]) -> None:
     """The master comes three hours late, and its first beacons leave the skew uncertain."""
     loop = running_loop()

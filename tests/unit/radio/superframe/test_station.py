@@ -109,6 +109,7 @@ def test_unconfirmed_master_cannot_acknowledge() -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.slow
 def test_all_measurements_arrive_within_their_bounds(loss: float, seed: int) -> None:
     """At any packet loss, beyond the wrap of eight-bit sequence numbers."""
     rng = np.random.default_rng(seed)

@@ -119,6 +119,7 @@ def test_kinds_are_parsed() -> None:
         parse_faults("loss,gremlins")
 
 
+@pytest.mark.slow
 def test_daemon_killed_during_shutdown_counts_as_stopped(tmp_path: Path) -> None:
     """Its final write is torn, in its own task or another; any other error during shutdown is raised."""
 

@@ -81,6 +81,7 @@ def test_recording_holds_the_samples_at_their_times(mission: MissionResult) -> N
     ],
     ids=["time", "value", "device-clock"],
 )
+@pytest.mark.slow
 def test_wrong_samples_violate_the_invariant(
     mission: MissionResult, change: Callable[[DeviceSamples], dict[str, Any]], found: str
 ) -> None:
@@ -112,6 +113,7 @@ def test_samples_missing_after_the_faults_violate_the_invariant(mission: Mission
     assert "are not recorded" in failure
 
 
+@pytest.mark.slow
 def test_measurements_are_those_without_an_imu_but_shaken(mission: MissionResult, tmp_path: Path) -> None:
     """Noise and times stay the same, so that distances differ by the shaking alone."""
     plain = run_mission(tmp_path, WITHOUT, duration_s=8.0, protocol=SUPERFRAME, seed=0)
@@ -130,6 +132,7 @@ def test_measurements_are_those_without_an_imu_but_shaken(mission: MissionResult
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_mission_with_few_stations(tmp_path: Path, count: int) -> None:
     """With one or two stations, measurements and samples are recorded without a violation."""
     # The estimator `linear` needs three prisms.
@@ -142,6 +145,7 @@ def test_mission_with_few_stations(tmp_path: Path, count: int) -> None:
     assert sum(len(record.stamp_ns) for record in read_imu_samples(path)) > 600
 
 
+@pytest.mark.slow
 def test_setup_is_checked_in_the_thread_of_the_mission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -521,6 +521,7 @@ async def test_crashing_program_is_restarted_with_delay() -> None:
     assert "no licence" in supervisor.condition.problem
 
 
+@pytest.mark.slow
 async def test_random_exits_lose_and_repeat_no_measurement() -> None:
     """Each run starts with the last measurement of the one before."""
     generator = random.Random(3)  # noqa: S311 (no secrets)

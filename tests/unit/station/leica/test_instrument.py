@@ -36,6 +36,7 @@ def occlusion(start_s: float, end_s: float) -> StatusFaultConfig:
 
 
 @pytest.mark.parametrize("rate_hz", [2.5, 7.0, 20.0])
+@pytest.mark.slow
 async def test_every_offered_distance_is_read_once(rate_hz: float) -> None:
     """At any rate: no repeats, no gaps, unchanged values."""
     async with leica_bench(rate_hz=rate_hz) as day:
@@ -529,6 +530,7 @@ async def test_power_cycle_resets_instrument_clock() -> None:
         assert abs(reading.at_ns - true_ns[reading.instrument_time_ns // 1_000_000]) < 20_000_000
 
 
+@pytest.mark.slow
 async def test_times_of_a_slowing_instrument() -> None:
     """An instrument that becomes four times as slow within two minutes does not pass for one whose clock runs slower."""
     async with leica_bench(leica_config(latency_ms=20.0)) as day:

@@ -108,6 +108,7 @@ def test_reference_of_another_time_is_said() -> None:
 
 
 @pytest.mark.parametrize("common", [False, True])
+@pytest.mark.slow
 def test_common_part_is_drawn_if_known(*, common: bool) -> None:
     """Dashed, so that it can be told apart without colour; the legend names it."""
     poses, truth = drive(common=common)

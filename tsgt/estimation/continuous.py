@@ -4,7 +4,7 @@ Each epoch (the whole multiples of a period in Unix time) gets a pose *predicted
 before, and a lag later one *smoothed* by the measurements on both sides. Smoothed poses are computed in groups, with the
 first prediction of each half second, which is cheaper. At each of the configured delays below the lag there is one more,
 smoothed by the measurements that have arrived by the first epoch at which the delay has passed. With an IMU the predictions
-integrate its samples from the newest measurement on; :mod:`~tsgt.estimation.inertial.takeover` says when it is used. The poses depend only on the order of the calls, not on when the
+integrate its samples from the newest measurement on; :mod:`~tsgt.estimation.inertial.selection` says when it is used. The poses depend only on the order of the calls, not on when the
 estimator is asked: a replay gives the same poses bit for bit.
 """
 
@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.inertial.takeover import UNCONFIRMED_SIGMAS, ImuTakeover
+from tsgt.estimation.inertial.selection import UNCONFIRMED_SIGMAS, ImuSelector
 from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
+from tsgt.estimation.pose_cache import PoseCache, SmoothedStateCache
 from tsgt.estimation.pose_output import ContinuousPoseOutput, MeasurementHistory
-from tsgt.estimation.poses_ahead import PosesAhead, SmoothedStatesAhead
 from tsgt.estimation.setup_uncertainty import InertialSetupUncertainty, setup_jacobian
 from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
@@ -70,7 +70,7 @@ class ContinuousEstimator:
         self._imu = (
             None
             if parameters.imu is None
-            else ImuTakeover(
+            else ImuSelector(
                 parameters.imu,
                 self._without_imu,
                 self._create_with_imu,
@@ -89,8 +89,8 @@ class ContinuousEstimator:
         self._next_epoch_ns: int | None = None
         self._next_smoothed_ns = 0
         self._first_epoch_ns = 0
-        self._ahead = PosesAhead(self._without_imu, self._poses, self._limits.period_ns)
-        self._smoothed_ahead = SmoothedStatesAhead(self._limits.period_ns)
+        self._pose_cache = PoseCache(self._without_imu, self._poses, self._limits.period_ns)
+        self._smoothed_cache = SmoothedStateCache(self._limits.period_ns)
         # The oldest epoch first. The window still has the states: a delay is below the lag.
         self._delays_ns = [*sorted(self._limits.smoothed_delays_ns, reverse=True), 0]
         # In whole periods
@@ -241,7 +241,7 @@ class ContinuousEstimator:
         jump: tuple[float, float] | None = None
         if window.initialised:
             if self._imu is None:
-                numbers = self._ahead.due(epoch_ns, ages_ns, self._origin_ns)
+                numbers = self._pose_cache.due(epoch_ns, ages_ns, self._origin_ns)
             else:
                 states, covariance, common = self._states_at(stamps_ns)
                 numbers = self._poses.numbers(states, self._with_allowance(covariance), common)
@@ -271,7 +271,7 @@ class ContinuousEstimator:
         common = self._window.common_at(time_s, dim=_POSE_DIM)
         if not smoothed_ns:
             return states, covariance, common
-        smoothed, smoothed_covariance, smoothed_common = self._smoothed_ahead.at(
+        smoothed, smoothed_covariance, smoothed_common = self._smoothed_cache.at(
             self._window.smoothed_trajectory(), smoothed_ns, self._origin_ns
         )
         if common is not None and smoothed_common is not None:

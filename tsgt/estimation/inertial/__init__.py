@@ -1,29 +1,29 @@
 """The robot's IMU and wheels in the estimation: their samples as arrays, a check of the set-up, and when they are used. Sans-I/O.
 
 In: recorded samples, measurements and parameters. Out: arrays for the estimator (`samples`, `wheels`), a set-up that is confirmed or
-contradicted while the robot drives (`setup_monitor`), and the trajectory with or without the IMU (`takeover`).
+contradicted while the robot drives (`setup_monitor`), and the trajectory with or without the IMU (`selection`).
 """
 
 from tsgt.estimation.inertial.samples import SampleConverter, inertial_samples
+from tsgt.estimation.inertial.selection import (
+    ImuSelector,
+    ImuState,
+    OdometryState,
+    QueriedTrajectory,
+    TrajectoryWindow,
+)
 from tsgt.estimation.inertial.setup_monitor import (
     ImuSetupMonitor,
     StartCheck,
     check_recorded_setup,
     start_now,
 )
-from tsgt.estimation.inertial.takeover import (
-    ImuState,
-    ImuTakeover,
-    OdometryState,
-    QueriedTrajectory,
-    TrajectoryWindow,
-)
 from tsgt.estimation.inertial.wheels import wheel_samples
 
 __all__ = [
+    "ImuSelector",
     "ImuSetupMonitor",
     "ImuState",
-    "ImuTakeover",
     "OdometryState",
     "QueriedTrajectory",
     "SampleConverter",

@@ -19,7 +19,7 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.batch import fit_trajectory, scale_noise
-from tsgt.geometry.inertial import Gravity, Mounting, fit_inertial_trajectory, sound_samples
+from tsgt.geometry.inertial import Gravity, Mounting, fit_inertial_trajectory, usable_samples
 from tsgt.geometry.inertial_calibration import (
     MIN_CHECKED_MEASUREMENTS,
     SetupCheck,
@@ -100,7 +100,7 @@ def check_recorded_setup(
     least = MIN_CHECKED_MEASUREMENTS if few_prisms else 1
     if len(observations) < least:
         return SetupCheck()
-    samples = sound_samples(inertial_samples(records, imu, origin_ns), imu)
+    samples = usable_samples(inertial_samples(records, imu, origin_ns), imu)
     if not len(samples):
         return SetupCheck()
     # A backlog arrives with measurements of times whose samples are held no more.
@@ -197,13 +197,13 @@ class ImuSetupMonitor:
         events, self._events = self._events, []
         return events
 
-    def restart(self, *, blow: bool = False) -> None:
+    def restart(self, *, shock: bool = False) -> None:
         """Confirm the set-up anew, from what comes from now on: it may have changed.
 
-        After a ``blow`` fewer than three prisms confirm nothing any more: they do not tell all rotations, and what they do not tell
+        After a ``shock`` fewer than three prisms confirm nothing any more: they do not tell all rotations, and what they do not tell
         is not as configured for certain.
         """
-        self._displaced |= blow and len(self._parameters.prisms) < MIN_PRISMS
+        self._displaced |= shock and len(self._parameters.prisms) < MIN_PRISMS
         self._measurements.clear()
         self._records.clear()
         self._next_ns = self._result = None

@@ -12,7 +12,7 @@ from tsgt.geometry.inertial.live import (
     InertialFixedLagSmoother,
     SaturationMonitor,
     WindowTrajectory,
-    sound_samples,
+    usable_samples,
 )
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
@@ -74,7 +74,7 @@ __all__ = [
     "preintegrate",
     "search_heading",
     "solve_inertial",
-    "sound_samples",
     "states_on_tracks",
     "strapdown",
+    "usable_samples",
 ]

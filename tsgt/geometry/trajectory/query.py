@@ -57,7 +57,7 @@ class Trajectory:
     process_noise_share: float = 1.0  # Of the prior's variances between the knots
 
     @property
-    def settled_until_s(self) -> float:
+    def unchanged_until_s(self) -> float:
         """Time of the last knot."""
         return float(self.knots.time_s[-1])
 

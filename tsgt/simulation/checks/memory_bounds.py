@@ -28,7 +28,7 @@ STATED_BOUNDS = {
     ("Backlog", "queued"): QUEUE_CAPACITY,
     ("Backlog", "receptions"): MAX_RECEPTIONS,
     ("ImuSetupMonitor", "_records"): MAX_IMU_LINES,
-    ("ImuTakeover", "_records"): MAX_IMU_LINES,
+    ("ImuSelector", "_records"): MAX_IMU_LINES,
     **dict.fromkeys(
         (("ClockSegment", name) for name in ("_forward", "_samples", "_received_ns")), MAX_SAMPLES
     ),

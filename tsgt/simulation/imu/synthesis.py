@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _NODES, _WEIGHTS = (each / 2 for each in np.polynomial.legendre.leggauss(4))
 KNOCK_S = 0.02
-"""How long the IMU moves when it is knocked: a blow by a stone or a boot."""
+"""How long the IMU moves when it is knocked: a shock by a stone or a boot."""
 
 _BLOCK = 4096  # samples at once, which bounds memory
 

@@ -111,18 +111,18 @@ def test_knock_after_confirmation_is_reported() -> None:
 
 @pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
 def test_few_prisms_do_not_confirm_after_a_blow(prisms: int, *, confirmed: bool) -> None:
-    """A drive does not show them all rotations by which the blow may have turned the IMU."""
+    """A drive does not show them all rotations by which the shock may have turned the IMU."""
     monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
     monitored.run(18)
     assert monitored.monitor.confirmed
-    monitored.monitor.restart(blow=True)
+    monitored.monitor.restart(shock=True)
     monitored.run(18)
     assert monitored.monitor.confirmed == confirmed
 
 
 @pytest.mark.parametrize("prisms", [2, 1])
 def test_few_prisms_confirm_anew_after_a_disagreement(prisms: int) -> None:
-    """Whatever made the samples disagree, it was no blow."""
+    """Whatever made the samples disagree, it was no shock."""
     monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
     monitored.run(18)
     monitored.monitor.restart()

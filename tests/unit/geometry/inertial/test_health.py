@@ -14,7 +14,7 @@ from tsgt.geometry.inertial import (
     InertialFixedLagSmoother,
     InertialSamples,
     SaturationMonitor,
-    sound_samples,
+    usable_samples,
 )
 from tsgt.geometry.inertial.live.health import HOLD_S, MAX_AGE_S, STUCK_S, HealthMonitor
 from tsgt.model import MotionPrior
@@ -215,18 +215,18 @@ def test_blow_puts_the_setup_in_doubt() -> None:
     """For good."""
     monitor, used, reasons = judged(changed(slice(700, 702), force=np.array([0.0, 90.0, 9.0])))
     assert np.flatnonzero(~used).tolist() == [700, 701]
-    assert "a blow may have displaced it" in reasons
+    assert "a shock may have displaced it" in reasons
     assert reasons[-1] is None
-    assert monitor.setup_in_doubt
-    assert monitor.blow
-    assert not judged(SAMPLES)[0].setup_in_doubt
+    assert monitor.setup_uncertain
+    assert monitor.shock
+    assert not judged(SAMPLES)[0].setup_uncertain
 
 
 def test_bad_samples_of_a_drive_are_left_out() -> None:
     """And no others."""
     samples = changed(slice(700, 702), force=np.array([0.0, 90.0, 9.0]))
     assert (
-        np.setdiff1d(samples.end_s, sound_samples(samples, IMU).end_s).tolist()
+        np.setdiff1d(samples.end_s, usable_samples(samples, IMU).end_s).tolist()
         == samples.end_s[700:702].tolist()
     )
 

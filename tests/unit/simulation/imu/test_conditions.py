@@ -137,7 +137,7 @@ def test_knock_turns_the_axes_and_moves_the_origin() -> None:
 
 
 def test_knock_is_part_of_the_motion() -> None:
-    """The gyro measures the turn, the accelerometer a blow that moves the origin from rest to rest."""
+    """The gyro measures the turn, the accelerometer a shock that moves the origin from rest to rest."""
     knock = Knock(2.0, (0.0, 0.02, 0.0), (0.003, 0.0, 0.0))
     sound, knocked = _run().samples, _run(knock).samples
     during = (sound.end_s > 2.0) & (sound.end_s < 2.03)

@@ -1,13 +1,13 @@
 """The trajectory with an IMU online: a window of knots that moves with time, and prediction to now. Sans-I/O.
 
 In: samples and measurements as they arrive, late ones too. Out: predicted and smoothed states with covariances, and whether the IMU
-is to be believed (`health`, `saturation`). `start_search` finds a trajectory, `fixed_lag` updates its window (`window`) from `held_samples`;
+is used (`health`, `saturation`). `start_search` finds a trajectory, `fixed_lag` updates its window (`window`) from `held_samples`;
 `window_trajectory` gives its states at any time; `prediction` integrates from its newest knot, and `rate_prediction` goes on where
 samples end; `known_rotation` carries a rotation over a loss.
 """
 
 from tsgt.geometry.inertial.live.fixed_lag import InertialFixedLagSmoother
-from tsgt.geometry.inertial.live.health import DISAGREES_WITH_PRISMS, sound_samples
+from tsgt.geometry.inertial.live.health import DISAGREES_WITH_PRISMS, usable_samples
 from tsgt.geometry.inertial.live.saturation import SaturationMonitor
 from tsgt.geometry.inertial.live.window_trajectory import WindowTrajectory
 
@@ -16,5 +16,5 @@ __all__ = [
     "InertialFixedLagSmoother",
     "SaturationMonitor",
     "WindowTrajectory",
-    "sound_samples",
+    "usable_samples",
 ]

@@ -161,26 +161,26 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     @property
     def health(self) -> str | None:
-        """Why the IMU is not to be believed now, for people; None: it is.
+        """Why the samples of the IMU are rejected now, for people; None: they are used.
 
         A reason is given while values are stuck, beyond any range, or at the limit of an axis; where the newest sample
         is older than 0.4 s at the time of a prediction; and when two prisms disagree with the samples within 1.2 s (one, three times
         in succession, where none other is measured). Stuck values and values beyond any range are left out. When prisms
         disagree, the trajectory is started anew from what comes after. Save for old samples, the reason stays for 2 s after its last cause; then, and
-        once there is a trajectory again, the IMU is to be believed. :class:`~tsgt.geometry.inertial.live.health.HealthMonitor` gives the
+        once there is a trajectory again, the samples are used. :class:`~tsgt.geometry.inertial.live.health.HealthMonitor` gives the
         grounds of the thresholds.
         """
         return self._health.reason
 
     @property
-    def setup_in_doubt(self) -> bool:
-        """Whether the mounting of the IMU may have changed: by a blow, or by whatever made the samples disagree with the prisms."""
-        return self._health.setup_in_doubt
+    def setup_uncertain(self) -> bool:
+        """Whether the mounting of the IMU may have changed: by a shock, or by whatever made the samples disagree with the prisms."""
+        return self._health.setup_uncertain
 
     @property
-    def blow(self) -> bool:
-        """Whether a blow may have displaced it."""
-        return self._health.blow
+    def shock(self) -> bool:
+        """Whether a shock may have displaced it."""
+        return self._health.shock
 
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""
@@ -356,7 +356,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._reliable_from_s = _measured_twice_s(observations.select(~outliers))
         else:
             self.residuals_m = np.full((len(observations), 3), np.nan)
-            # Samples from before the IMU was sound again contradict the measurements: the next search does without the older half.
+            # Samples from before the IMU was consistent again contradict the measurements: the next search does without the older half.
             middle_s = 0.5 * (searched.time_s[0] + searched.time_s[-1])
             self._searched = searched.select(searched.time_s >= middle_s)
             self._horizon_s = max(self._horizon_s, float(middle_s))
@@ -364,7 +364,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             raise GeometryError("the measurements do not determine the trajectory")
 
     def _keeps_rotation(self) -> bool:
-        """Whether the rotation of a start is the one from before, as the gyro has carried it on.
+        """Whether the rotation of a start is the one from before, propagated by the gyro.
 
         A tripod that has moved or tilted turns what two prisms tell of the rotation, or all that one tells of the heading.
         """
@@ -372,7 +372,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if self._known is None:
             return True
         knots = self._solved.window.knots
-        known = self._carried(self._known, float(knots.time_s[-1]))
+        known = self._propagated(self._known, float(knots.time_s[-1]))
         turned = log_so3(known.rotation.T @ knots.rotation[-1])
         covariance = known.covariance[:3, :3] + self._solved.factor.last_covariance()[3:6, 3:6]
         return float(turned @ np.linalg.solve(covariance, turned)) < MAX_ROTATION_SQUARES
@@ -381,17 +381,17 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Remember the rotation that the measurements before the window told, or the one from before: newer ones may be wrong."""
         known = self._known
         if known is not None:
-            known = None if newest_s > known.until_s else self._carried(known, newest_s)
+            known = None if newest_s > known.until_s else self._propagated(known, newest_s)
         if self._window is not None:
-            lost = self._carried(KnownRotation.of(self._window.anchor), newest_s)
+            lost = self._propagated(KnownRotation.of(self._window.anchor), newest_s)
             # A trajectory that was lost soon knows less than the one before it.
             if known is None or np.trace(lost.covariance[:3, :3]) < np.trace(known.covariance[:3, :3]):
                 known = lost
         self._known = known
 
-    def _carried(self, known: KnownRotation, time_s: float) -> KnownRotation:
+    def _propagated(self, known: KnownRotation, time_s: float) -> KnownRotation:
         times_s = np.array([known.time_s, max(time_s, known.time_s)])
-        return known.carried(self._held.contiguous(times_s), float(times_s[1]), self._noise)
+        return known.propagated(self._held.contiguous(times_s), float(times_s[1]), self._noise)
 
     def _update_tracked(self, held: Observations, new: Observations) -> bool:
         assert self._window is not None  # noqa: S101 (converged)

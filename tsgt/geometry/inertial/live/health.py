@@ -1,4 +1,4 @@
-"""Whether the samples of an IMU can be believed: by themselves, and against the prisms. Sans-I/O."""
+"""Whether the samples of an IMU can be used: checked by themselves, and against the prisms. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ STUCK_S = 0.1
 MAX_RATE_RADPS, MAX_FORCE_MPS2 = 40.0, 350.0
 """Beyond any measuring range (2000 deg/s and 32 g are 35 rad/s and 314 m/s^2): such values are no measurements."""
 
-BLOW_MPS2 = 50.0
-"""Specific force of a blow, on any axis: bumps and slopes give 15 m/s^2, a bracket that is knocked gives hundreds."""
+SHOCK_MPS2 = 50.0
+"""Specific force of a shock, on any axis: bumps and slopes give 15 m/s^2, a bracket that is knocked gives hundreds."""
 
 INCONSISTENT_NIS = 25.0
 """NIS (3 degrees of freedom) of a measurement that disagrees with the samples; 1.5 in 100 000 consistent ones exceed it."""
@@ -38,18 +38,18 @@ DISAGREES_WITH_PRISMS = "it disagrees with the prisms"
 ALONE = 3  # Successive measurements of one prism that disagree, where none other is measured: it cannot be told from the IMU
 
 HOLD_S = 2.0
-"""For which the samples must have been sound again: a few measurements of each prism, which have agreed with them."""
+"""How long the samples must have been consistent again: a few measurements of each prism, which have agreed with them."""
 
 
-_SOUND_PART = 100  # Samples at once, which bounds the span in which a limit is looked for
+_PART = 100  # Samples at once, which bounds the span in which a limit is looked for
 
 
-def sound_samples(samples: InertialSamples, imu: ImuParameters) -> InertialSamples:
+def usable_samples(samples: InertialSamples, imu: ImuParameters) -> InertialSamples:
     """Return those that can be used, judged by themselves."""
     monitor = HealthMonitor(imu)
     parts = [
-        monitor.samples(samples.select(slice(first, first + _SOUND_PART)))
-        for first in range(0, len(samples), _SOUND_PART)
+        monitor.samples(samples.select(slice(first, first + _PART)))
+        for first in range(0, len(samples), _PART)
     ]
     return samples.select(np.concatenate(parts)) if parts else samples
 
@@ -64,8 +64,8 @@ class HealthMonitor:
 
     ``saturation``: finds values at the limit of the device, and knows those limits that earlier monitors have met.
 
-    ``setup_in_doubt``: the mounting may have changed, by a blow or whatever made the samples disagree with the prisms. ``blow``: by a
-    blow.
+    ``setup_uncertain``: the mounting may have changed, by a shock or whatever made the samples disagree with the prisms. ``shock``: by a
+    shock.
     """
 
     def __init__(self, imu: ImuParameters, saturation: SaturationMonitor | None = None) -> None:
@@ -74,14 +74,14 @@ class HealthMonitor:
         self._newest_s = -np.inf
         self._problem = ""
         self._problem_s = -np.inf
-        self.setup_in_doubt = self.blow = False
+        self.setup_uncertain = self.shock = False
         self._same_s = 0.0
         self.stuck_from_s = np.inf  # The values have not changed since, for too long
         self._innovations: deque[tuple[float, int, bool]] = deque()
 
     @property
     def reason(self) -> str | None:
-        """Why the samples are not to be believed now, for people; None: they are."""
+        """Why the samples are rejected now, for people; None: they are used."""
         if self._now_s - self._problem_s < HOLD_S:
             return self._problem
         age_s = self._now_s - self._newest_s
@@ -100,13 +100,13 @@ class HealthMonitor:
             np.maximum.reduce(np.abs(each), axis=1)
             for each in (new.angular_rate_radps, new.specific_force_mps2)
         )
-        sound: NDArray[np.bool_] = (largest_rates < MAX_RATE_RADPS) & (largest_forces < MAX_FORCE_MPS2)
-        if not sound.all():
-            self._report("values beyond any measuring range", float(new.end_s[~sound][-1]))
-        blows: NDArray[np.bool_] = sound & (largest_forces > BLOW_MPS2)
-        if blows.any():
-            self.setup_in_doubt = self.blow = True
-            self._report("a blow may have displaced it", float(new.end_s[blows][-1]))
+        usable: NDArray[np.bool_] = (largest_rates < MAX_RATE_RADPS) & (largest_forces < MAX_FORCE_MPS2)
+        if not usable.all():
+            self._report("values beyond any measuring range", float(new.end_s[~usable][-1]))
+        shocks: NDArray[np.bool_] = usable & (largest_forces > SHOCK_MPS2)
+        if shocks.any():
+            self.setup_uncertain = self.shock = True
+            self._report("a shock may have displaced it", float(new.end_s[shocks][-1]))
         unchanged, at_limit = self._saturation.samples(new)
         self._check_stuck(new, unchanged)
         if at_limit.any():
@@ -116,8 +116,8 @@ class HealthMonitor:
                     self._report(f"the {sensor} is at the limit of the device", float(new.end_s[rows[-1]]))
         self._newest_s = max(self._newest_s, float(new.end_s[-1]))
         self._now_s = max(self._now_s, self._newest_s)
-        sound &= ~(blows | at_limit.any(axis=1))
-        return sound
+        usable &= ~(shocks | at_limit.any(axis=1))
+        return usable
 
     def _check_stuck(self, new: InertialSamples, same: NDArray[np.bool_]) -> None:
         if not same.any() and self._same_s == 0.0:
@@ -142,7 +142,7 @@ class HealthMonitor:
         alone = len(measured) == 1 and len(newest) == ALONE and all(newest)
         if len(inconsistent) < 2 and not alone:
             return False
-        self.setup_in_doubt = True
+        self.setup_uncertain = True
         self._report(DISAGREES_WITH_PRISMS, max(self._now_s, float(time_s[-1])))
         self._innovations.clear()
         return True

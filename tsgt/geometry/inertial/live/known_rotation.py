@@ -1,4 +1,4 @@
-"""Rotation of an IMU that its gyro carries on while there is no trajectory. Sans-I/O."""
+"""Rotation of an IMU, propagated by its gyro while there is no trajectory. Sans-I/O."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from tsgt.model import ImuNoise
 
 ROTATION_MEMORY_S = 300.0
-"""For which a start must have the rotation from before: should that have been wrong itself, no start would be right."""
+"""How long an initialisation must agree with the rotation from before: if that was wrong itself, no initialisation would be right."""
 
 _ROTATION_AND_BIAS = [3, 4, 5, 9, 10, 11]  # Of the gyro, in the error of a state
 
 
 class KnownRotation(NamedTuple):
-    """Rotation of the IMU and bias of its gyro at a time; they count until another."""
+    """Rotation of the IMU and bias of its gyro at a time; valid until ``until_s``."""
 
     time_s: float
     rotation: FloatArray  # (3, 3) of the IMU
@@ -45,8 +45,8 @@ class KnownRotation(NamedTuple):
             time_s + ROTATION_MEMORY_S,
         )
 
-    def carried(self, samples: ContiguousSamples, time_s: float, noise: ImuNoise) -> KnownRotation:
-        """Integrate samples up to a time."""
+    def propagated(self, samples: ContiguousSamples, time_s: float, noise: ImuNoise) -> KnownRotation:
+        """Return them at a later time, by integration of samples."""
         ends = np.array([self.time_s]), np.array([time_s])
         found = preintegrate(samples, *ends, self.gyro_bias, np.zeros(3))
         jacobian, added = np.eye(6), np.zeros((6, 6))

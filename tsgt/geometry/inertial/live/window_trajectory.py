@@ -31,7 +31,7 @@ class WindowTrajectory:
     predicted_common: Callable[[float, int], FloatArray]
 
     @property
-    def settled_until_s(self) -> float:
+    def unchanged_until_s(self) -> float:
         """Time up to which states do not depend on samples that arrive later; a single knot has no inside."""
         knots_s = self.inside.knots.time_s
         return float(knots_s[-1]) if len(knots_s) > 1 else -np.inf
@@ -69,7 +69,7 @@ class WindowTrajectory:
 
     def _beyond(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """Whether times are predicted."""
-        return time_s > self.settled_until_s
+        return time_s > self.unchanged_until_s
 
 
 def _order(beyond: NDArray[np.bool_]) -> NDArray[np.intp]:

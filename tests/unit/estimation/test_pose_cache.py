@@ -10,7 +10,7 @@ from harness.drives.prior_motion import draw_motions, measure, sorted_by_time
 from harness.drives.scene import stationary_scene
 
 from tsgt.estimation import ContinuousPoseOutput
-from tsgt.estimation.poses_ahead import EPOCHS, PosesAhead, SmoothedStatesAhead
+from tsgt.estimation.pose_cache import EPOCHS, PoseCache, SmoothedStateCache
 from tsgt.geometry.trajectory import FixedLagSmoother, States
 from tsgt.model import MotionPrior
 
@@ -27,7 +27,7 @@ def test_poses_are_those_of_each_epoch_alone() -> None:
     observations = sorted_by_time(measure(motion, until_s=3.0, seed=2))
     output = ContinuousPoseOutput(stationary_scene().parameters)
     smoothers = [FixedLagSmoother(MotionPrior()) for _ in range(2)]
-    ahead = PosesAhead(smoothers[0], output, PERIOD_NS)
+    ahead = PoseCache(smoothers[0], output, PERIOD_NS)
     added, compared = 0, 0
     for number in range(20, 58):
         time_s = number * PERIOD_NS / 1e9
@@ -57,7 +57,7 @@ def test_poses_are_those_of_each_epoch_alone() -> None:
 class Line:
     """A trajectory along a line, settled up to a time."""
 
-    settled_until_s: float
+    unchanged_until_s: float
     speed_mps: float = 1.0
     asked: list[int] = field(default_factory=list)  # Number of times in each query
 
@@ -75,7 +75,7 @@ class Line:
         return None
 
 
-def positions(ahead: SmoothedStatesAhead, line: Line, stamps_ns: list[int]) -> list[float]:
+def positions(ahead: SmoothedStateCache, line: Line, stamps_ns: list[int]) -> list[float]:
     """Return the position at epochs."""
     states, covariance, _ = ahead.at(line, [ORIGIN_NS + each for each in stamps_ns], ORIGIN_NS)
     assert len(covariance) == len(stamps_ns)
@@ -84,7 +84,7 @@ def positions(ahead: SmoothedStatesAhead, line: Line, stamps_ns: list[int]) -> l
 
 def test_smoothed_states_of_several_epochs_are_computed_together() -> None:
     """Until there is another trajectory; those of two ages in any order."""
-    ahead, line = SmoothedStatesAhead(PERIOD_NS), Line(10.0)
+    ahead, line = SmoothedStateCache(PERIOD_NS), Line(10.0)
     for number in range(2 * EPOCHS):
         found = positions(ahead, line, [(20 + number) * PERIOD_NS, (40 + number) * PERIOD_NS])
         np.testing.assert_allclose(found, [1.0 + 0.05 * number, 2.0 + 0.05 * number])
@@ -95,7 +95,7 @@ def test_smoothed_states_of_several_epochs_are_computed_together() -> None:
 
 def test_states_that_later_samples_change_are_not_kept() -> None:
     """The same epoch beyond the newest knot, asked for again."""
-    ahead, line = SmoothedStatesAhead(PERIOD_NS), Line(1.0)
+    ahead, line = SmoothedStateCache(PERIOD_NS), Line(1.0)
     assert positions(ahead, line, [19 * PERIOD_NS]) == [0.95]
     assert line.asked == [2]  # 0.95 and 1.0
     assert positions(ahead, line, [21 * PERIOD_NS]) == [1.05]

@@ -1,4 +1,4 @@
-"""Poses of the next epochs, computed together. Sans-I/O.
+"""Cache of poses of the next epochs, computed together. Sans-I/O.
 
 Live, a few epochs pass between two measurements, and nothing changes meanwhile. Poses of several epochs cost little more than
 those of one.
@@ -23,7 +23,7 @@ EPOCHS = 3  # Seven measurements a second come for 20 epochs a second
 _POSE_DIM = 6  # Dimension of a state's error that poses need: position and rotation
 
 
-class PosesAhead:
+class PoseCache:
     """Poses of a fixed-lag smoother at epochs, which are multiples of a period; the same bits as of each epoch alone."""
 
     def __init__(self, smoother: FixedLagSmoother, output: ContinuousPoseOutput, period_ns: int) -> None:
@@ -69,7 +69,7 @@ class PosesAhead:
         self._revision = self._smoother.revision
 
 
-class SmoothedStatesAhead:
+class SmoothedStateCache:
     """Smoothed states of any window at epochs, which are multiples of a period; new ones for each trajectory."""
 
     def __init__(self, period_ns: int) -> None:
@@ -82,14 +82,14 @@ class SmoothedStatesAhead:
         self, trajectory: QueriedTrajectory, stamps_ns: list[int], origin_ns: int
     ) -> tuple[States, FloatArray, FloatArray | None]:
         """Return states at epochs, the covariance of their poses, and its common part; ``origin_ns``: of the trajectory's times."""
-        if (max(stamps_ns) - origin_ns) / 1e9 > trajectory.settled_until_s:
+        if (max(stamps_ns) - origin_ns) / 1e9 > trajectory.unchanged_until_s:
             return _poses(trajectory, stamps_ns, origin_ns)
         if trajectory is not self._trajectory or any(each not in self._rows for each in stamps_ns):
             following = (each + i * self._period_ns for each in stamps_ns for i in range(1, EPOCHS))
-            settled_ns = origin_ns + 1e9 * trajectory.settled_until_s
-            ahead_ns = sorted({*stamps_ns, *(each for each in following if each <= settled_ns)})
-            self._trajectory, self._found = trajectory, _poses(trajectory, ahead_ns, origin_ns)
-            self._rows = {each: row for row, each in enumerate(ahead_ns)}
+            unchanged_until_ns = origin_ns + 1e9 * trajectory.unchanged_until_s
+            cached_ns = sorted({*stamps_ns, *(each for each in following if each <= unchanged_until_ns)})
+            self._trajectory, self._found = trajectory, _poses(trajectory, cached_ns, origin_ns)
+            self._rows = {each: row for row, each in enumerate(cached_ns)}
         assert self._found is not None  # noqa: S101 (computed above)
         states, covariance, common = self._found
         rows = np.array([self._rows[each] for each in stamps_ns])

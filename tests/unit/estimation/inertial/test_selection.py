@@ -15,14 +15,14 @@ from harness.files.records import IMU_PARAMETERS, imu_samples
 from tsgt.estimation import LiveEstimator
 from tsgt.estimation.continuous import ContinuousEstimator
 from tsgt.estimation.inertial import setup_monitor as imu_setup_monitor
-from tsgt.estimation.inertial.takeover import (
+from tsgt.estimation.inertial.selection import (
+    NO_TRAJECTORY_S,
     PROVEN_S,
     QUARANTINE_S,
+    RECOVERY_S,
     SILENCE_S,
-    SOUND_S,
-    UNAIDED_S,
+    ImuSelector,
     ImuState,
-    ImuTakeover,
 )
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial import WheelsEstimate
@@ -52,7 +52,7 @@ class FakeInertialSmoother(FixedLagSmoother):
         self.saturation = saturation
         self.up_m = UP_M
         self.health: str | None = None
-        self.setup_in_doubt = self.blow = False
+        self.setup_uncertain = self.shock = False
         self.contradicted = False
         self.wheels: WheelsEstimate | None = None
         self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
@@ -156,7 +156,7 @@ def test_silence_gives_the_poses_without_imu_and_sound_samples_take_it_back(scen
     _, _, (silent, silent_s), (used, used_s) = uses_from(poses)
     assert (silent, used) == ("silent", "used")
     assert silent_s == pytest.approx(2.0 + SILENCE_S, abs=0.11)
-    assert used_s == pytest.approx(2.8 + SOUND_S, abs=0.16)
+    assert used_s == pytest.approx(2.8 + RECOVERY_S, abs=0.16)
     without = replace(scene, parameters=replace(scene.parameters, imu=None))
     expected = {pose.stamp_ns: pose for pose in predicted(records(without, arrivals(scene, 4.5)))}
     for pose in poses:
@@ -200,8 +200,8 @@ def test_disagreement_starts_anew_and_waits(scene: Scene, wrong: dict[str, Any],
     assert len({id(each.saturation) for each in FakeInertialSmoother.created}) == 1
 
 
-def test_poses_after_a_takeover_are_those_of_an_estimator_without_imu(scene: Scene) -> None:
-    """To the bit: measurements from before the takeover still arrive, though the window with the IMU has begun anew after them."""
+def test_poses_after_a_change_are_those_of_an_estimator_without_imu(scene: Scene) -> None:
+    """To the bit: measurements from before the change still arrive, though the window with the IMU was reinitialised after them."""
     live = checked(scene)
     poses: list[PoseRecord] = []
     arrived = arrivals(scene, 5.0)
@@ -266,74 +266,74 @@ def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
     without = SimpleNamespace(converged=False, ambiguous=False)
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
     setup = SimpleNamespace(untrusted=None, confirmed=False)
-    takeover = ImuTakeover(
+    selector = ImuSelector(
         IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
     )
-    takeover.begin(START)
+    selector.begin(START)
     uses = []
-    for number in range(3 * round(UNAIDED_S)):
-        takeover.add_samples(imu_samples(100 * number, count=100))
-        takeover.take_samples()
-        takeover.choose(0.5 * (number + 1))
-        uses.append(takeover.use)
-        without.converged = number >= 2.5 * UNAIDED_S
+    for number in range(3 * round(NO_TRAJECTORY_S)):
+        selector.add_samples(imu_samples(100 * number, count=100))
+        selector.take_samples()
+        selector.choose(0.5 * (number + 1))
+        uses.append(selector.use)
+        without.converged = number >= 2.5 * NO_TRAJECTORY_S
         without.ambiguous = True
     changes = [use for use, _ in itertools.groupby(uses)]
     assert changes == [ImuUse.UNCONFIRMED, ImuUse.USED, ImuUse.UNCONFIRMED]
-    assert uses.index(ImuUse.USED) == round(2 * UNAIDED_S)
+    assert uses.index(ImuUse.USED) == round(2 * NO_TRAJECTORY_S)
 
 
 @pytest.fixture
-def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuTakeover, SimpleNamespace, SimpleNamespace]:
+def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace, SimpleNamespace]:
     """Return what chooses, a window with IMU, and the monitor of its set-up; all is well."""
-    monkeypatch.setattr(ImuTakeover, "_compare", lambda *_: None)
+    monkeypatch.setattr(ImuSelector, "_compare", lambda *_: None)
     without = SimpleNamespace(converged=True, ambiguous=False)
     window = SimpleNamespace(
         converged=True,
         ambiguous=False,
         health=None,
-        setup_in_doubt=False,
-        blow=False,
+        setup_uncertain=False,
+        shock=False,
         add_samples=lambda _: None,
     )
-    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="", blow=False)
-    setup.restart = lambda *, blow: vars(setup).update(confirmed=False, blow=blow)
-    takeover = ImuTakeover(
+    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="", shock=False)
+    setup.restart = lambda *, shock: vars(setup).update(confirmed=False, shock=shock)
+    selector = ImuSelector(
         IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
     )
-    takeover.begin(START)
-    return takeover, window, setup
+    selector.begin(START)
+    return selector, window, setup
 
 
-def uses_of(takeover: ImuTakeover, from_s: float, until_s: float) -> list[tuple[ImuUse, float]]:
+def uses_of(selector: ImuSelector, from_s: float, until_s: float) -> list[tuple[ImuUse, float]]:
     """Choose ten times a second; return each use, and for how long."""
     uses = []
     for number in range(round(10 * from_s), round(10 * until_s)):
-        takeover.add_samples(imu_samples(20 * number, count=20))
-        takeover.take_samples()
-        takeover.choose(0.1 * (number + 1))
-        uses.append(takeover.use)
+        selector.add_samples(imu_samples(20 * number, count=20))
+        selector.take_samples()
+        selector.choose(0.1 * (number + 1))
+        uses.append(selector.use)
     return [(use, 0.1 * len(list(each))) for use, each in itertools.groupby(uses)]
 
 
 @pytest.mark.parametrize(
-    ("fault", "use"), [("stuck", ImuUse.USED), ("blow", ImuUse.UNCONFIRMED), ("prisms", ImuUse.UNCONFIRMED)]
+    ("fault", "use"), [("stuck", ImuUse.USED), ("shock", ImuUse.UNCONFIRMED), ("prisms", ImuUse.UNCONFIRMED)]
 )
 def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
-    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace], fault: str, use: ImuUse
+    sound: tuple[ImuSelector, SimpleNamespace, SimpleNamespace], fault: str, use: ImuUse
 ) -> None:
-    """After a blow, and where the prisms contradict, the IMU may have moved for good."""
-    takeover, window, setup = sound
-    uses_of(takeover, 0.0, 1.0)
-    window.health, window.blow = (fault if fault != "prisms" else None), fault == "blow"
-    window.setup_in_doubt = window.blow
+    """After a shock, and where the prisms contradict, the IMU may have moved for good."""
+    selector, window, setup = sound
+    uses_of(selector, 0.0, 1.0)
+    window.health, window.shock = (fault if fault != "prisms" else None), fault == "shock"
+    window.setup_uncertain = window.shock
     window.ambiguous = fault == "prisms"
-    found = [uses_of(takeover, 1.0, 1.6)[-1][0]]
-    window.health, window.setup_in_doubt, window.ambiguous = None, False, False
-    found.append(uses_of(takeover, 1.6, 7.0)[-1][0])
-    assert setup.blow == (fault == "blow")
+    found = [uses_of(selector, 1.0, 1.6)[-1][0]]
+    window.health, window.setup_uncertain, window.ambiguous = None, False, False
+    found.append(uses_of(selector, 1.6, 7.0)[-1][0])
+    assert setup.shock == (fault == "shock")
     setup.confirmed = True
-    found.append(uses_of(takeover, 7.0, 7.1)[-1][0])
+    found.append(uses_of(selector, 7.0, 7.1)[-1][0])
     assert found == [ImuUse.DISAGREES, use, ImuUse.USED]
 
 
@@ -342,7 +342,7 @@ def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
     [(3, False, [4.0, 8.0, 16.0, 4.0]), (2, True, [4.0, 8.0, 16.0, 4.0]), (2, False, [4.0, 4.0, 4.0, 4.0])],
 )
 def test_quarantine_doubles_with_each_disagreement_in_a_row(
-    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+    sound: tuple[ImuSelector, SimpleNamespace, SimpleNamespace],
     monkeypatch: pytest.MonkeyPatch,
     prisms: int,
     expected: list[float],
@@ -350,17 +350,17 @@ def test_quarantine_doubles_with_each_disagreement_in_a_row(
     in_doubt: bool,
 ) -> None:
     """And is short again after a minute of use; it stays short where two prisms alone lose their poses to what the samples show."""
-    takeover, window, setup = sound
-    monkeypatch.setattr(takeover, "_prisms", prisms)
-    window.setup_in_doubt, window.followed_for_s = in_doubt, 0.0
+    selector, window, setup = sound
+    monkeypatch.setattr(selector, "_prisms", prisms)
+    window.setup_uncertain, window.followed_for_s = in_doubt, 0.0
     setup.restart = lambda **_: None
     found, now_s = [], 0.0
     for used_s in (1.0, 1.0, 1.0, PROVEN_S + 1.0):
-        uses_of(takeover, now_s, now_s + used_s)
+        uses_of(selector, now_s, now_s + used_s)
         window.health = "stuck"
-        uses_of(takeover, now_s + used_s, now_s + used_s + 0.1)
+        uses_of(selector, now_s + used_s, now_s + used_s + 0.1)
         window.health = None
-        (_, wrong_s), _ = uses_of(takeover, now_s + used_s + 0.1, now_s + used_s + 20.0)
+        (_, wrong_s), _ = uses_of(selector, now_s + used_s + 0.1, now_s + used_s + 20.0)
         found.append(wrong_s)
         now_s += used_s + 0.1 + wrong_s
     assert found == pytest.approx(expected, abs=0.11)
@@ -371,53 +371,53 @@ def test_samples_between_rare_poses_are_all_used() -> None:
     taken: list[InertialSamples] = []
     driven: list[WheelSamples] = []
     window = SimpleNamespace(add_samples=taken.append, add_odometry=driven.append)
-    takeover = ImuTakeover(
+    selector = ImuSelector(
         IMU_PARAMETERS, cast("Any", None), lambda: cast("Any", window), odometry=OdometryParameters()
     )
     for number in range(60):  # Half seconds
         if number == 40:
-            takeover.begin(START)
+            selector.begin(START)
         record = imu_samples(100 * number, count=100)
-        takeover.add_samples(record)
-        takeover.add_odometry(wheels_beside(record))
-    takeover.take_samples()
+        selector.add_samples(record)
+        selector.add_odometry(wheels_beside(record))
+    selector.take_samples()
     (samples,), (wheels,) = taken, driven
     assert 3000 <= len(samples) <= 3100
     assert 30 <= len(wheels) <= 31
 
 
 def test_silence_does_not_shorten_a_quarantine(
-    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+    sound: tuple[ImuSelector, SimpleNamespace, SimpleNamespace],
 ) -> None:
     """An IMU that disagreed and then is silent for half a second is used no sooner."""
-    takeover, window, _ = sound
-    uses_of(takeover, 0.0, 1.0)
+    selector, window, _ = sound
+    uses_of(selector, 0.0, 1.0)
     window.health = "stuck"
-    uses_of(takeover, 1.0, 1.1)
+    uses_of(selector, 1.0, 1.1)
     window.health = None
-    uses_of(takeover, 1.1, 2.0)
-    takeover.choose(2.5)
-    found = uses_of(takeover, 2.5, 10.0)
+    uses_of(selector, 1.1, 2.0)
+    selector.choose(2.5)
+    found = uses_of(selector, 2.5, 10.0)
     assert [use for use, _ in found] == [ImuUse.SILENT, ImuUse.USED]
     assert found[0][1] == pytest.approx(1.1 + QUARANTINE_S - 2.5, abs=0.11)
 
 
 def test_unconfirmed_imu_is_not_used_sooner_because_stations_had_none_long_ago(
-    sound: tuple[ImuTakeover, SimpleNamespace, SimpleNamespace],
+    sound: tuple[ImuSelector, SimpleNamespace, SimpleNamespace],
 ) -> None:
     """The time without a trajectory of the stations counts from when that was lost, also while the IMU was used."""
-    takeover, window, setup = sound
+    selector, window, setup = sound
     setup.confirmed = False
-    uses_of(takeover, 0.0, 1.0)
+    uses_of(selector, 0.0, 1.0)
     setup.confirmed = True
-    uses_of(takeover, 1.0, 30.0)
-    cast("Any", takeover._without).converged = False
-    window.health, window.setup_in_doubt, window.blow = "a blow", True, True
-    uses_of(takeover, 30.0, 30.1)
+    uses_of(selector, 1.0, 30.0)
+    cast("Any", selector._without).converged = False
+    window.health, window.setup_uncertain, window.shock = "a shock", True, True
+    uses_of(selector, 30.0, 30.1)
     window.health = None
-    found = uses_of(takeover, 30.1, 50.0)
+    found = uses_of(selector, 30.1, 50.0)
     assert [use for use, _ in found] == [ImuUse.DISAGREES, ImuUse.UNCONFIRMED, ImuUse.USED]
-    assert 0.1 + found[0][1] + found[1][1] == pytest.approx(UNAIDED_S, abs=0.21)
+    assert 0.1 + found[0][1] + found[1][1] == pytest.approx(NO_TRAJECTORY_S, abs=0.21)
 
 
 def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
@@ -425,7 +425,7 @@ def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
 ) -> None:
     """In its covariance, and it is degraded."""
     confirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
-    monkeypatch.setattr(ImuTakeover, "unconfirmed", True)
+    monkeypatch.setattr(ImuSelector, "unconfirmed", True)
     unconfirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
     assert "imu_unconfirmed" not in confirmed.degraded_by
     assert unconfirmed.degraded_by == ("imu_unconfirmed",)
@@ -449,7 +449,7 @@ def test_outage_of_all_prisms_with_an_unconfirmed_imu(scene: Scene, monkeypatch:
         return [each for each in predicted(records(scene, arrived)) if time_of(each) > 2.85]
 
     assert any(each.valid for each in in_outage())
-    monkeypatch.setattr(ImuTakeover, "unconfirmed", True)
+    monkeypatch.setattr(ImuSelector, "unconfirmed", True)
     assert {(each.valid, each.reason) for each in in_outage()} == {(False, "outage")}
 
 
@@ -474,18 +474,18 @@ def test_contradiction_of_one_or_two_stations_lasts(
     """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
-    window.setup_in_doubt = window.blow = False
-    takeover = ImuTakeover(IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), prisms=prisms)
-    takeover.begin(START)
+    window.setup_uncertain = window.shock = False
+    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), prisms=prisms)
+    selector.begin(START)
     found = []
     for number in range(20):
         window.ambiguous = 8 <= number < 12
         window.followed_for_s = followed_for_s if number >= 12 else 0.0
         window.health = health if number == 10 else None
-        takeover.add_samples(imu_samples(100 * number, count=100))
-        takeover.take_samples()
-        takeover.choose(0.5 * (number + 1))
-        found.append(takeover.station_contradicted)
+        selector.add_samples(imu_samples(100 * number, count=100))
+        selector.take_samples()
+        selector.choose(0.5 * (number + 1))
+        found.append(selector.station_contradicted)
     assert not any(found[:10])
     assert found[-1] == contradicted
 

@@ -1,4 +1,4 @@
-"""Takes the trajectory with the IMU while that is sound, and the one without while it is not. Sans-I/O.
+"""Selects the trajectory with the IMU while its samples are consistent with the prisms, otherwise the one without it. Sans-I/O.
 
 Where three stations measure, the IMU is not used before the drive has confirmed its set-up.
 
@@ -40,23 +40,23 @@ ODOMETRY_SILENCE_S = 1.0
 MAX_REJECTED_SHARE = 0.5
 """Share of the last seconds of wheel odometry, rejected one by one, above which it disagrees."""
 
-SOUND_S = 1.0
-"""How long a silent IMU must have been heard again before its trajectory is used."""
+RECOVERY_S = 1.0
+"""How long a silent IMU must have delivered samples again before its trajectory is used."""
 
 QUARANTINE_S, MAX_QUARANTINE_S = 4.0, 64.0
-"""How long an IMU that disagreed must have been sound: until the window holds nothing from before, and each time twice as long if it
+"""How long an IMU that disagreed must have been consistent: until the window holds nothing from before, and each time twice as long if it
 disagrees again within :data:`PROVEN_S` of use. It stays as long where the samples have shown by themselves what was wrong and when that
 had passed, and there are no poses without them.
 """
 PROVEN_S = 60.0
 
 CONTRADICTION_S = 0.4
-"""How long measurements may contradict the trajectory with the IMU, and not the one without, until that takes over. A single
+"""How long measurements may contradict the trajectory with the IMU, and not the one without, until that is used. A single
 wrong measurement contradicts for no longer: those of the other prisms follow.
 """
 
-UNAIDED_S = 10.0
-"""Three stations without a trajectory for so long are not about to have one."""
+NO_TRAJECTORY_S = 10.0
+"""Three stations that had no trajectory for so long are not expected to have one soon."""
 
 UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 """Of the position in m and the rotation in rad by what an unconfirmed set-up may have wrong: a mounting 1 deg off moves poses by
@@ -81,7 +81,7 @@ class QueriedTrajectory(Protocol):
     """A trajectory with its uncertainty, over the times of a window."""
 
     @property
-    def settled_until_s(self) -> float:
+    def unchanged_until_s(self) -> float:
         """Time up to which states stay the same, whatever arrives."""
         ...
 
@@ -170,11 +170,11 @@ class InertialWindow(TrajectoryWindow, Protocol):
 
     @property
     def health(self) -> str | None:
-        """Why the IMU is not to be believed now, for people; None: it is."""
+        """Why the samples of the IMU are rejected now, for people; None: they are used."""
         ...
 
     @property
-    def setup_in_doubt(self) -> bool:
+    def setup_uncertain(self) -> bool:
         """Whether its mounting may have changed."""
         ...
 
@@ -184,8 +184,8 @@ class InertialWindow(TrajectoryWindow, Protocol):
         ...
 
     @property
-    def blow(self) -> bool:
-        """Whether a blow may have displaced it."""
+    def shock(self) -> bool:
+        """Whether a shock may have displaced the IMU."""
         ...
 
     @property
@@ -224,10 +224,10 @@ class ImuState(NamedTuple):
     odometry: OdometryState | None = None  # None without wheel odometry
 
 
-_WRONG = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
+_REJECTED_USES = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
 
 
-class ImuTakeover:
+class ImuSelector:
     """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
 
     ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement.
@@ -260,9 +260,9 @@ class ImuTakeover:
         self._wheels: WheelConverter | None = None
         self._driven: deque[OdometrySamples] = deque()
         self._now_s = self._driven_s = -np.inf  # Of the newest call, and of the newest sample of the wheels
-        self._newest_s = self._sound_from_s = self._next_comparison_s = -np.inf
+        self._newest_s = self._usable_from_s = self._next_comparison_s = -np.inf
         self._contradicted_from_s = np.inf
-        self._unaided_from_s: float | None = None
+        self._no_trajectory_from_s: float | None = None
         self._nis = (0.0, 0.0)  # of the predicted and of a smoothed pose
         self._contradiction = ""
         self._quarantine_s, self._used_from_s = 0.0, -np.inf
@@ -278,7 +278,7 @@ class ImuTakeover:
         """Return what is known of the IMU now."""
         biases = self._with.biases if self._with.converged else None
         gyro, accelerometer = (None, None) if biases is None else biases
-        disagreement = self._disagreement if self.use in _WRONG else ""
+        disagreement = self._disagreement if self.use in _REJECTED_USES else ""
         if self.use == ImuUse.UNCONFIRMED and self._setup is not None:
             disagreement = self._setup.unconfirmed
         return ImuState(self.use, disagreement, _vector(gyro), _vector(accelerometer), self._odometry_state())
@@ -358,32 +358,32 @@ class ImuTakeover:
     def choose(self, now_s: float) -> None:
         """Choose the window for poses that are sent at a time."""
         self._now_s = now_s
-        if self._without.converged or self._unaided_from_s is None:
-            self._unaided_from_s = now_s
+        if self._without.converged or self._no_trajectory_from_s is None:
+            self._no_trajectory_from_s = now_s
         if self.use == ImuUse.USED and now_s >= self._next_comparison_s:
             self._next_comparison_s = now_s + COMPARISON_INTERVAL_S
             self._compare(now_s)
         found = self._found(now_s)
         if self._prisms < MIN_PRISMS:
             self._watch_stations(found)
-        if found in _WRONG:
+        if found in _REJECTED_USES:
             self._disagreement = self._untrusted or self._contradiction
             # What the samples show by themselves passes; whatever else it was may have come to stay.
-            doubt = self._with.setup_in_doubt or self._with.health is None
-            if found == ImuUse.DISAGREES and doubt and self._setup is not None:
-                self._setup.restart(blow=self._with.blow)
+            uncertain = self._with.setup_uncertain or self._with.health is None
+            if found == ImuUse.DISAGREES and uncertain and self._setup is not None:
+                self._setup.restart(shock=self._with.shock)
             if self.use == ImuUse.USED:
                 again = now_s - self._used_from_s < PROVEN_S
                 # With fewer than three prisms there are no poses meanwhile.
-                longer = 2 if doubt or self._prisms >= MIN_PRISMS else 1
+                longer = 2 if uncertain or self._prisms >= MIN_PRISMS else 1
                 self._quarantine_s = min(longer * self._quarantine_s, MAX_QUARANTINE_S) if again else 0.0
             self._contradicted_from_s, self._nis, self._contradiction = np.inf, (0.0, 0.0), ""
             self._with = self._create_with()
             self._quarantine_s = max(self._quarantine_s, QUARANTINE_S)
-            self._sound_from_s = now_s + self._quarantine_s
+            self._usable_from_s = now_s + self._quarantine_s
         elif found == ImuUse.SILENT:
-            self._sound_from_s = max(self._sound_from_s, now_s + SOUND_S)
-        elif now_s < self._sound_from_s:
+            self._usable_from_s = max(self._usable_from_s, now_s + RECOVERY_S)
+        elif now_s < self._usable_from_s:
             found = self.use
         if found != ImuUse.USED:
             self._update_without()
@@ -435,8 +435,8 @@ class ImuTakeover:
         """Whether the IMU is not to be used yet. Where no three prisms are measured there is nothing else."""
         if self._setup is None or self._setup.confirmed:
             return False
-        assert self._unaided_from_s is not None  # noqa: S101 (choose sets it)
-        return now_s - self._unaided_from_s < (UNAIDED_S if self._prisms >= MIN_PRISMS else 0.0)
+        assert self._no_trajectory_from_s is not None  # noqa: S101 (choose sets it)
+        return now_s - self._no_trajectory_from_s < (NO_TRAJECTORY_S if self._prisms >= MIN_PRISMS else 0.0)
 
     @property
     def unconfirmed(self) -> bool:
@@ -444,7 +444,7 @@ class ImuTakeover:
         return self.use == ImuUse.USED and self._setup is not None and not self._setup.confirmed
 
     def _contradicted(self, now_s: float) -> bool:
-        """Whether the IMU is not sound, or the trajectory with it was and is not, while the one without is."""
+        """Whether the IMU is rejected, or the trajectory with it has diverged while the one without has converged."""
         self._contradiction = self._contradiction or self._with.health or ""
         if self._contradiction:
             return True

@@ -11,7 +11,7 @@ from tsgt.client import Event, Gap, Pose, Stream
 
 
 def follow(source: str, key: str | None) -> None:
-    """Print poses of now, events and gaps, for ever; connections are made again when they are lost."""
+    """Print live poses, events and gaps, for ever; connections are made again when they are lost."""
     with Stream(source, key=key) as stream:
         for record in stream:
             if isinstance(record, Event):

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from harness.inertial.imu_calibration import in_calibrated_axes
 
 from tsgt.config import SuperframeMasterConfig
 from tsgt.errors import GeometryError
@@ -31,7 +32,7 @@ from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.geometry import log_so3, quaternion_from_rotation
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.inertial import Mounting, fit_inertial_trajectory
-from tsgt.geometry.inertial_calibration import ImuSetup, in_calibrated_axes
+from tsgt.geometry.inertial_calibration import ImuSetup
 from tsgt.log import configure_logging
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording

@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from harness.inertial.imu_calibration import in_calibrated_axes
 from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.calibration import calibrate_recorded_imu
 from tsgt.config import SimulatedImu, SuperframeMasterConfig
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial import Mounting
-from tsgt.geometry.inertial_calibration import ImuSetup, in_calibrated_axes
+from tsgt.geometry.inertial_calibration import ImuSetup
 from tsgt.log import configure_logging
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.imu import IMU_MODELS

@@ -8,7 +8,7 @@ measurement, once everywhere and once while each prism's measurements before and
 epochs that has a pose; mean NEES of the six components, 6 if the stated covariance is right; CPU time by minute of data. The
 set-up is exact, and the missions have the scenarios' own occlusions, over the superframe.
 
-`linear`: linear interpolation of each prism and a rigid fit of the layout, the paper's way. Cubic spline: an interpolating one
+`linear`: linear interpolation of each prism and a rigid fit of the layout, the paper's method. Cubic spline: an interpolating one
 through the points of each prism, and a rigid fit. Quintic spline: one for position, roll, pitch and yaw, a knot each 0.5 s, least
 squares on all points, weakly smoothed. gtsam: a state at each measurement and epoch, factors in Python, Levenberg-Marquardt,
 Cauchy loss; white acceleration or white jerk, with the densities of the motion prior that `continuous` tuned, whose cost counts there

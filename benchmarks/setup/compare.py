@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from evo.core import metrics, sync
 from evo.core import trajectory as evo_trajectory
+from harness.drives.estimates import GNSS, LIDAR, VISUAL_INERTIAL, draw_relation, simulate_estimate
 from measuring import Stopwatch
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
@@ -58,14 +59,14 @@ from tsgt.geometry import (
     transform_from,
 )
 from tsgt.model import ROBOT_ORIGIN
-from tsgt.simulation.estimates import GNSS, LIDAR, VISUAL_INERTIAL, draw_relation, simulate_estimate
 from tsgt.simulation.scenario_files import find_scenario
 from tsgt.simulation.world import scenario_world
 
 if TYPE_CHECKING:
+    from harness.drives.estimates import EstimateModel, PoseAt, SimulatedEstimate, TrueRelation
+
     from tsgt.analysis.compare import Fit, PairedPoses
     from tsgt.geometry import FloatArray
-    from tsgt.simulation.estimates import EstimateModel, PoseAt, SimulatedEstimate, TrueRelation
     from tsgt.simulation.world import World
 
 KINDS = {"lidar": LIDAR, "visual-inertial": VISUAL_INERTIAL, "gnss": GNSS}

@@ -631,7 +631,8 @@ class Stream {
     if (count < 0) {
       if (errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR) fail(errno);
       const std::int64_t now = monotonic_ns(), silent = heard_ + (ready_ ? detail::kSilenceTimeout : detail::kConnectTimeout);
-      if (over_relay() && now >= silent) throw detail::Lost("nothing arrives");
+      if (over_relay() && now >= silent)
+        throw detail::Lost("nothing received for " + std::to_string((silent - heard_) / detail::kSecond) + " s; check the network and the relay");
       emptied(now);
       if (!records_.empty()) return;
       if (over_relay()) until = std::min(until, silent);

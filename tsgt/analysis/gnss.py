@@ -35,7 +35,7 @@ INSIDE_EARTH_M = 6.3e6  # From the Earth's centre; RTKLIB writes the centre itse
 QUALITY_ORDER = (1, 2, 6, 4, 3, 5, 7, 0)  # RTKLIB's Q, best first
 _RANK = np.argsort(QUALITY_ORDER)
 
-# GPS - UTC grew by 1 s at the begin of each of these months: IERS Bulletin C. None has been announced since 2017.
+# GPS - UTC grew by 1 s at the beginning of each of these months: IERS Bulletin C. None has been announced since 2017.
 _LEAP_SECONDS = (
     "1981-07 1982-07 1983-07 1985-07 1988-01 1990-01 1991-01 1992-07 1993-07 "
     "1994-07 1996-01 1997-07 1999-01 2006-01 2009-01 2012-07 2015-07 2017-01"

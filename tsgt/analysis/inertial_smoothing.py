@@ -95,7 +95,10 @@ def fit_with_imu(
     samples = inertial_samples(records, imu, origin_ns)
     start_s, end_s = float(observations.time_s[0]), float(observations.time_s[-1])
     if not len(samples) or samples.end_s[-1] < start_s or samples.end_s[0] > end_s:
-        raise GeometryError("the samples of the IMU are from another time than the measurements")
+        raise GeometryError(
+            "the samples of the IMU do not overlap with the measurements in time; give those of this drive, or shift them with "
+            "tsgt import imu --offset-ms"
+        )
 
     wheels = None
     if parameters.odometry is not None and odometry:

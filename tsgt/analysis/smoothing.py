@@ -40,6 +40,8 @@ from tsgt.geometry.batch import (
     with_noise_floor,
 )
 from tsgt.geometry.rest import find_rest
+from tsgt.geometry.trajectory import POSE_DIM
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -60,10 +62,6 @@ if TYPE_CHECKING:
 
 # Bounds the memory of intermediate results, which should fit into the CPU cache.
 _EPOCHS_PER_CHUNK = 1024
-
-_POSE_DIM = 6
-
-MIN_PRISMS = 3  # Without an IMU
 
 TWO_PRISMS = 2  # Measured for a minute they tell what a single prism does not: the rotation of the IMU, but about their line
 
@@ -184,7 +182,7 @@ def _smoothed(
         motion = estimate_motion_model(observations, parameters.pipeline, start=refined.motion_prior)
     imu, problem = None, ""
     if parameters.imu is not None and not recording.imu_samples:
-        problem = "the recording has no samples of it"
+        problem = "the recording has no IMU samples; give --imu, a file of tsgt import imu, or --no-imu"
     if with_imu and (complete or len(parameters.prisms) == TWO_PRISMS):
         problem = wrong_imu_setup(parameters, measurements, recording.imu_samples)
         if problem and not complete:
@@ -364,8 +362,8 @@ class _PoseSeries:
         seen = self._history(residuals_m)
         for some_ns in _chunks(epochs_ns):
             time_s = self._time_s(some_ns)
-            states, covariance = trajectory.at(time_s, dim=_POSE_DIM)
-            common = trajectory.common_at(time_s, dim=_POSE_DIM)
+            states, covariance = trajectory.at(time_s, dim=POSE_DIM)
+            common = trajectory.common_at(time_s, dim=POSE_DIM)
             yield self._output.smoothed(some_ns, seen, states, covariance, common=common)
 
     def _time_s(self, epochs_ns: NDArray[np.int64]) -> FloatArray:

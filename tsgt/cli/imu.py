@@ -37,8 +37,8 @@ def imu() -> None:
 def vectornav(*, port: str, baud: int, rate_hz: int) -> None:
     """Read a VectorNav VN-100.
 
-    PORT is its serial port, such as /dev/serial/by-id/usb-... The rate divides 800. The setting of the device's output
-    is changed until it is switched off.
+    PORT is its serial port, such as /dev/serial/by-id/usb-... The rate must be a divisor of 800. The output settings
+    are lost when the device is switched off.
     """
     from tsgt.imu.vectornav import VectorNav
 

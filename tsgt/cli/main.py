@@ -116,7 +116,7 @@ def run(command: click.Command, arguments: list[str] | None = None) -> NoReturn:
         if type(error).__name__ != "LinAlgError":  # of numpy, which most commands do not load
             raise
         click.echo(
-            f"error: the computation fails ({error}): a sigma, a coordinate or a distance of the input is absurd",
+            f"error: numerical failure ({error}): check the input for impossible sigmas, coordinates or distances",
             err=True,
         )
         sys.exit(1)

@@ -172,7 +172,7 @@ def point_option(default: str = "as recorded, else the robot's origin") -> Calla
         "--point",
         type=PointType(),
         metavar=_POINT_METAVAR,
-        help="Point of the robot that the poses are of: robot, centroid, imu (its name), or position in m and quaternion in "
+        help="Reference point whose pose is given: robot, centroid, imu (its name), or position in m and quaternion in "
         f"the robot frame.  [default: {default}]",
     )
 
@@ -181,7 +181,7 @@ reference_point_option = click.option(
     "--reference-point",
     type=PointType(),
     metavar=_POINT_METAVAR,
-    help="Point of the robot that the reference trajectory is of, as --point.  "
+    help="Reference point of the reference trajectory; values as for --point.  "
     "[default: as its file states, else the robot's origin]",
 )
 

@@ -276,7 +276,8 @@ class Pump:
             return
         deadline_ns = self._deadline_ns()
         if deadline_ns is not None and self._now_ns() >= deadline_ns:
-            raise StreamError("nothing arrives")
+            silent_s = (deadline_ns - self._received_ns) / 1e9
+            raise StreamError(f"nothing received for {silent_s:.0f} s; check the network and the relay")
 
     def _lost(self, error: OSError) -> None:
         self._failures_at_key = self._failures_at_key + 1 if self._link.failed_at_key else 0

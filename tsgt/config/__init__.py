@@ -53,7 +53,7 @@ from tsgt.config.parameters import (
     parameters_in_force,
     scenario_parameters,
 )
-from tsgt.config.permissions import check_permissions
+from tsgt.config.permissions import check_permissions, user_name
 from tsgt.config.pipeline import PipelineConfig, ReferencePointConfig
 from tsgt.config.radio import (
     MAX_STATION_NUMBERS,
@@ -158,4 +158,5 @@ __all__ = [
     "parameters_in_force",
     "scenario_parameters",
     "setup_covariance",
+    "user_name",
 ]

@@ -53,13 +53,14 @@ def check_permissions(path: Path, *, user: int | None = None) -> None:
             )
         if what.st_uid not in owners:
             raise ConfigError(
-                f"{path}: {each} belongs to the user {_name(what.st_uid)} and lies in {folder}, where everybody can "
+                f"{path}: {each} belongs to the user {user_name(what.st_uid)} and lies in {folder}, where everybody can "
                 "create files; use a folder of your own",
                 path=path,
             )
 
 
-def _name(uid: int) -> str:
+def user_name(uid: int) -> str:
+    """Return the name of a user of this machine; the id without one."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:

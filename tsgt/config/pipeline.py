@@ -22,7 +22,7 @@ class MotionConfig(Model):
     """Motion prior of the estimator ``continuous``; `tsgt process` prints the one tuned to a recording."""
 
     acceleration_sigma_mps2: PerAxis = (0.4, 0.4, 0.2)
-    """One sigma of the acceleration of the prisms' middle along x, y, z of station 1."""
+    """One sigma of the acceleration of the prisms' centroid along x, y, z of station 1."""
     acceleration_correlation_time_s: Lasting = 0.8
     """Correlation time of the acceleration."""
     angular_acceleration_sigma_radps2: PerAxis = (0.15, 0.15, 0.2)

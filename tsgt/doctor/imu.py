@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from typing import TYPE_CHECKING
 
 from tsgt.clock import UnixTimeline
-from tsgt.doctor.finding import failed, note, ok, skipped
+from tsgt.doctor.finding import failed, note, ok
+from tsgt.doctor.sensor_program import obstacle, status_after
 from tsgt.imu import Imu
 
 if TYPE_CHECKING:
@@ -31,15 +31,8 @@ async def check_imu(machine: Machine, config: ImuConfig | None, *, daemon: bool)
     """Run the program for some seconds; the robot must be at rest. None configured: no finding."""
     if config is None:
         return []
-    if daemon:
-        return [skipped("imu", "the running master reads it; `tsgt listen` and its status show how well")]
-    if machine.which(config.command[0]) is None:
-        return [
-            failed(
-                "imu",
-                f"the program {config.command[0]} does not exist or is not executable: command under [imu]",
-            )
-        ]
+    if (found := obstacle(machine, "imu", config.command, daemon=daemon)) is not None:
+        return [found]
     records: list[ImuSamples] = []
     imu = Imu(
         config,
@@ -49,13 +42,7 @@ async def check_imu(machine: Machine, config: ImuConfig | None, *, daemon: bool)
         on_event=lambda _event, _message: None,
         start=machine.start_imu,
     )
-    task = asyncio.create_task(imu.run())
-    try:
-        await machine.clock.sleep_until(machine.clock.monotonic_ns() + round(DURATION_S * 1e9))
-        status = imu.status()
-    finally:
-        task.cancel()
-        await asyncio.wait([task])
+    status = await status_after(machine, imu, DURATION_S)
     if status.problem:
         return [failed("imu", f"{status.device or config.command[0]}: {status.problem}")]
     gravity = math.hypot(*_mean([each for record in records for each in record.specific_force_mps2]))

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from tsgt.config import user_name
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
@@ -103,11 +105,7 @@ class Machine:
 def current_user() -> User:
     """Return the user of this process."""
     uid = os.geteuid()
-    try:
-        name = pwd.getpwuid(uid).pw_name
-    except KeyError:
-        name = str(uid)
-    return User(name=name, uid=uid, groups=frozenset({os.getegid(), *os.getgroups()}))
+    return User(name=user_name(uid), uid=uid, groups=frozenset({os.getegid(), *os.getgroups()}))
 
 
 def find_user(name: str, groups: Sequence[str]) -> User | None:

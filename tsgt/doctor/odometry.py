@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING
 
 from tsgt.clock import UnixTimeline
-from tsgt.doctor.finding import failed, note, ok, skipped
+from tsgt.doctor.finding import failed, note, ok
+from tsgt.doctor.sensor_program import obstacle, status_after
 from tsgt.imu import WheelOdometry
 
 if TYPE_CHECKING:
@@ -25,17 +25,8 @@ async def check_odometry(machine: Machine, config: OdometryConfig | None, *, dae
     """Run the program for some seconds; the robot must be at rest. None configured: no finding."""
     if config is None:
         return []
-    if daemon:
-        return [
-            skipped("odometry", "the running master reads it; `tsgt listen` and its status show how well")
-        ]
-    if machine.which(config.command[0]) is None:
-        return [
-            failed(
-                "odometry",
-                f"the program {config.command[0]} does not exist or is not executable: command under [odometry]",
-            )
-        ]
+    if (found := obstacle(machine, "odometry", config.command, daemon=daemon)) is not None:
+        return [found]
     records: list[OdometrySamples] = []
     odometry = WheelOdometry(
         config,
@@ -45,13 +36,7 @@ async def check_odometry(machine: Machine, config: OdometryConfig | None, *, dae
         on_event=lambda _event, _message: None,
         start=machine.start_odometry,
     )
-    task = asyncio.create_task(odometry.run())
-    try:
-        await machine.clock.sleep_until(machine.clock.monotonic_ns() + round(DURATION_S * 1e9))
-        status = odometry.status()
-    finally:
-        task.cancel()
-        await asyncio.wait([task])
+    status = await status_after(machine, odometry, DURATION_S)
     if status.problem:
         return [failed("odometry", f"{status.device or config.command[0]}: {status.problem}")]
     speeds = [speed for record in records for speed in record.speed_mps]

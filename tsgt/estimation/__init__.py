@@ -41,7 +41,6 @@ from tsgt.estimation.setup_uncertainty import (
     InertialSetupUncertainty,
     parameter_names,
     setup_jacobian,
-    stated_covariance,
     uncertain_setup,
     with_setup,
 )
@@ -93,7 +92,6 @@ __all__ = [
     "setup_jacobian",
     "sigma_limits_of",
     "start_now",
-    "stated_covariance",
     "transform_between",
     "transform_of",
     "uncertain_setup",

@@ -28,24 +28,22 @@ from tsgt.estimation.tracks import has_plausible_time, measured_at_ns, usable
 from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
 from tsgt.geometry.inertial import InertialFixedLagSmoother, SaturationMonitor
-from tsgt.geometry.trajectory import FixedLagSmoother, concatenate_states
+from tsgt.geometry.trajectory import POSE_DIM, FixedLagSmoother, concatenate_states
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from tsgt.estimation.inertial import ImuSetupMonitor, ImuState, TrajectoryWindow
+    from tsgt.estimation.inertial import ImuSetupMonitor, ImuState
     from tsgt.estimation.pose_output import PoseNumbers
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.trajectory import States
+    from tsgt.geometry.trajectory import MeasurementWindow, States
     from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
 
 SMOOTHING_INTERVAL_NS = 500_000_000
 
-_POSE_DIM = 6  # dimension of a state's error that poses need: position and rotation
-
-_NONE = np.empty((0, _POSE_DIM, _POSE_DIM))
+_NONE = np.empty((0, POSE_DIM, POSE_DIM))
 
 
 class ContinuousEstimator:
@@ -105,7 +103,7 @@ class ContinuousEstimator:
         return None if self._imu is None else self._imu.state()
 
     @property
-    def _window(self) -> TrajectoryWindow:
+    def _window(self) -> MeasurementWindow:
         return self._without_imu if self._imu is None else self._imu.window
 
     def _create_with_imu(self) -> InertialFixedLagSmoother:
@@ -177,13 +175,13 @@ class ContinuousEstimator:
         self._imu.take_samples()
         before, window = None, self._window
         if self._pending and window.converged:
-            before = window.predict(epoch_s, dim=_POSE_DIM)[0]
+            before = window.predict(epoch_s, dim=POSE_DIM)[0]
         self._use_pending()
         self._imu.choose(epoch_s)
         if self._window is not window:
             self._record(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.intp))
             if before is None and window.converged:
-                before = window.predict(epoch_s, dim=_POSE_DIM)[0]
+                before = window.predict(epoch_s, dim=POSE_DIM)[0]
         return before if self._window.converged else None
 
     def _use_pending(self) -> None:
@@ -267,8 +265,8 @@ class ContinuousEstimator:
         """Return states, their covariance and its common part at epochs: smoothed, and at the last one predicted."""
         *smoothed_ns, epoch_ns = stamps_ns
         time_s = float((epoch_ns - self._origin_ns) / 1e9)
-        states, covariance = self._window.predict(time_s, dim=_POSE_DIM)
-        common = self._window.common_at(time_s, dim=_POSE_DIM)
+        states, covariance = self._window.predict(time_s, dim=POSE_DIM)
+        common = self._window.common_at(time_s, dim=POSE_DIM)
         if not smoothed_ns:
             return states, covariance, common
         smoothed, smoothed_covariance, smoothed_common = self._smoothed_cache.at(
@@ -329,8 +327,8 @@ class ContinuousEstimator:
         time_s = (stamp_ns - self._origin_ns) / 1e9
         if self._window.initialised:
             trajectory = self._window.smoothed_trajectory()
-            states, covariance = trajectory.at(time_s, dim=_POSE_DIM)
-            common = trajectory.common_at(time_s, dim=_POSE_DIM)
+            states, covariance = trajectory.at(time_s, dim=POSE_DIM)
+            common = trajectory.common_at(time_s, dim=POSE_DIM)
         return self._with_imu_use(
             self._poses.smoothed(
                 stamp_ns,

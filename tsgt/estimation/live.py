@@ -30,17 +30,17 @@ class LiveEstimator:
     """
 
     def __init__(self, parameters: Parameters, start_check: StartCheck = start_now) -> None:
-        continuous = parameters.pipeline.estimator == "continuous"
         calibrated = parameters.no_poses is None
-        self._with_imu = continuous and calibrated and parameters.imu is not None
         self._setup = None
         if calibrated and parameters.imu is not None:
             self._setup = ImuSetupMonitor(parameters, start_check)
+        self._continuous: ContinuousEstimator | None = None
         self._estimator: ContinuousEstimator | LinearEstimator | None = None
-        if calibrated:
-            self._estimator = (
-                ContinuousEstimator(parameters, self._setup) if continuous else LinearEstimator(parameters)
-            )
+        if calibrated and parameters.pipeline.estimator == "continuous":
+            self._estimator = self._continuous = ContinuousEstimator(parameters, self._setup)
+        elif calibrated:
+            self._estimator = LinearEstimator(parameters)
+        self._with_imu = None if parameters.imu is None else self._continuous
         self._now_ns = -(2**63)
         self._begun = False
 
@@ -66,26 +66,24 @@ class LiveEstimator:
 
     def imu_samples(self, samples: ImuSamples) -> list[ImuSamples | PoseRecord]:
         """Take samples of the IMU at their ``received_ns``, as :meth:`measurement`; return them after the poses due before."""
-        if not self._with_imu:
+        if self._with_imu is None:
             self._check_setup(samples)
             return [samples]
         if samples.received_ns < self._now_ns:
             samples = dataclasses.replace(samples, received_ns=self._now_ns)
         due = self.advance(samples.received_ns)
-        if isinstance(self._estimator, ContinuousEstimator):
-            self._estimator.add_samples(samples)
+        self._with_imu.add_samples(samples)
         self._check_setup(samples)
         return [*due, samples]
 
     def odometry_samples(self, samples: OdometrySamples) -> list[OdometrySamples | PoseRecord]:
         """Take samples of the wheel odometry, as :meth:`imu_samples`."""
-        if not self._with_imu:
+        if self._with_imu is None:
             return [samples]
         if samples.received_ns < self._now_ns:
             samples = dataclasses.replace(samples, received_ns=self._now_ns)
         due = self.advance(samples.received_ns)
-        if isinstance(self._estimator, ContinuousEstimator):
-            self._estimator.add_odometry(samples)
+        self._with_imu.add_odometry(samples)
         return [*due, samples]
 
     def _check_setup(self, samples: ImuSamples) -> None:
@@ -103,13 +101,11 @@ class LiveEstimator:
 
     def outside_lag_window(self) -> Mapping[int, int] | None:
         """Return by station how many measurements arrived outside the lag window; None with ``linear``."""
-        return (
-            self._estimator.outside_lag_window if isinstance(self._estimator, ContinuousEstimator) else None
-        )
+        return None if self._continuous is None else self._continuous.outside_lag_window
 
     def imu_state(self) -> ImuState | None:
         """Return what the estimator knows of the IMU; None if it uses none."""
-        return self._estimator.imu_state() if isinstance(self._estimator, ContinuousEstimator) else None
+        return None if self._continuous is None else self._continuous.imu_state()
 
     def next_deadline_ns(self) -> int | None:
         """Return when :meth:`advance` has to be called if nothing arrives before; None while nothing is due."""

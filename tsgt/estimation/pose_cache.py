@@ -10,17 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.trajectory import concatenate_states
+from tsgt.geometry.trajectory import POSE_DIM, concatenate_states
 
 if TYPE_CHECKING:
-    from tsgt.estimation.inertial import QueriedTrajectory
     from tsgt.estimation.pose_output import ContinuousPoseOutput, PoseNumbers
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.trajectory import FixedLagSmoother, Predictions, States
+    from tsgt.geometry.trajectory import FixedLagSmoother, Predictions, QueriedTrajectory, States
 
 EPOCHS = 3  # Seven measurements a second come for 20 epochs a second
-
-_POSE_DIM = 6  # Dimension of a state's error that poses need: position and rotation
 
 
 class PoseCache:
@@ -53,15 +50,15 @@ class PoseCache:
         smoothed = [(each_ns, age_ns) for age_ns in smoothed_ages_ns for each_ns in epochs_ns]
         predicted = [(each_ns, 0) for each_ns in epochs_ns]
         time_s = _times_s(predicted, origin_ns)
-        found = self._predictions = self._smoother.predictions(time_s, dim=_POSE_DIM)
+        found = self._predictions = self._smoother.predictions(time_s, dim=POSE_DIM)
         states, covariance = found.states, found.covariance
-        common = self._smoother.predictions_common(time_s, dim=_POSE_DIM)
+        common = self._smoother.predictions_common(time_s, dim=POSE_DIM)
         if smoothed:
             trajectory, time_s = self._smoother.smoothed_trajectory(), _times_s(smoothed, origin_ns)
-            some, some_covariance = trajectory.at(time_s, dim=_POSE_DIM)
+            some, some_covariance = trajectory.at(time_s, dim=POSE_DIM)
             states = concatenate_states([states, some])
             covariance = np.concatenate([covariance, some_covariance])
-            some_common = trajectory.common_at(time_s, dim=_POSE_DIM)
+            some_common = trajectory.common_at(time_s, dim=POSE_DIM)
             if common is not None and some_common is not None:
                 common = np.concatenate([common, some_common])
         self._numbers = self._output.numbers(states, covariance, common)
@@ -100,7 +97,7 @@ def _poses(
     trajectory: QueriedTrajectory, stamps_ns: list[int], origin_ns: int
 ) -> tuple[States, FloatArray, FloatArray | None]:
     time_s = (np.array(stamps_ns, dtype=np.int64) - origin_ns) / 1e9
-    return (*trajectory.at(time_s, dim=_POSE_DIM), trajectory.common_at(time_s, dim=_POSE_DIM))
+    return (*trajectory.at(time_s, dim=POSE_DIM), trajectory.common_at(time_s, dim=POSE_DIM))
 
 
 def _times_s(keys: list[tuple[int, int]], origin_ns: int) -> FloatArray:

@@ -5,7 +5,7 @@ interpolated tracks. Conventions: docs/explanation/conventions.md. Whatever lies
 bits for an item alone as in a batch: live stream, replay and post-processing agree exactly.
 """
 
-from tsgt.geometry.alignment import Alignment, BatchAlignment, align, align_many, align_triplets
+from tsgt.geometry.alignment import BatchAlignment, align, align_many, align_triplets
 from tsgt.geometry.euler import euler_angles_rad, euler_covariance, euler_jacobian
 from tsgt.geometry.fit_consistency import covariance_scale, squared_misfit
 from tsgt.geometry.interpolation import (
@@ -17,17 +17,14 @@ from tsgt.geometry.interpolation import (
     interpolation_error_s2,
 )
 from tsgt.geometry.polar import (
-    cartesian_jacobian,
     cartesian_to_polar,
     corrected_angles,
     corrected_distance,
     measurement_covariance,
-    polar_jacobian,
     polar_to_cartesian,
     raw_distance,
 )
 from tsgt.geometry.pose import (
-    Poses,
     check_layout,
     covariance_over_lever_arm,
     interpolation_errors,
@@ -38,7 +35,6 @@ from tsgt.geometry.pose import (
 )
 from tsgt.geometry.rigid import (
     FloatArray,
-    check_transform,
     exp_so3,
     invert,
     log_so3,
@@ -52,18 +48,14 @@ from tsgt.geometry.rigid import (
 
 __all__ = [
     "NO_GAP_NS",
-    "Alignment",
     "BatchAlignment",
     "FloatArray",
     "Interpolated",
-    "Poses",
     "align",
     "align_many",
     "align_triplets",
-    "cartesian_jacobian",
     "cartesian_to_polar",
     "check_layout",
-    "check_transform",
     "corrected_angles",
     "corrected_distance",
     "covariance_over_lever_arm",
@@ -80,7 +72,6 @@ __all__ = [
     "invert",
     "log_so3",
     "measurement_covariance",
-    "polar_jacobian",
     "polar_to_cartesian",
     "pose_covariance",
     "pose_displacement",

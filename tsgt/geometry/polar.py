@@ -1,4 +1,4 @@
-"""Polar measurements of a total station: conversion, corrections, Jacobians, noise.
+"""Polar measurements of a total station: conversion, corrections, noise.
 
 The station frame is right-handed with z up. Horizontal angles run clockwise, seen from above, from the x axis; zenith
 angles run from straight up. All functions work element by element and broadcast; NaN passes through.
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.errors import GeometryError
 from tsgt.geometry.rigid import IDENTITY
 
 if TYPE_CHECKING:
@@ -80,50 +79,6 @@ def corrected_angles(
 def raw_distance(distance_m: ArrayLike, *, constant_m: float, ppm: float) -> FloatArray:
     """Raw slope distance in m; inverse of :func:`corrected_distance`."""
     return (np.asarray(distance_m, dtype=np.float64) - constant_m) / (1 + ppm * 1e-6)
-
-
-def polar_jacobian(
-    horizontal_angle_rad: ArrayLike, zenith_angle_rad: ArrayLike, distance_m: ArrayLike
-) -> FloatArray:
-    """Jacobian of :func:`polar_to_cartesian`, (..., 3, 3): x, y, z by horizontal angle, zenith angle (m/rad), distance (1)."""
-    h, z, d = np.broadcast_arrays(
-        *(np.asarray(a, dtype=np.float64) for a in (horizontal_angle_rad, zenith_angle_rad, distance_m))
-    )
-    sin_h, cos_h, sin_z, cos_z = np.sin(h), np.cos(h), np.sin(z), np.cos(z)
-    return np.stack(
-        [
-            np.stack([-d * sin_z * sin_h, -d * sin_z * cos_h, np.zeros_like(d)], axis=-1),
-            np.stack([d * cos_z * cos_h, -d * cos_z * sin_h, -d * sin_z], axis=-1),
-            np.stack([sin_z * cos_h, -sin_z * sin_h, cos_z], axis=-1),
-        ],
-        axis=-1,
-    )
-
-
-def cartesian_jacobian(points: ArrayLike) -> FloatArray:
-    """Jacobian of :func:`cartesian_to_polar` at points, (..., 3) in m: the inverse of :func:`polar_jacobian`, (..., 3, 3).
-
-    Raises GeometryError: a point lies on the station's vertical axis: its horizontal angle has no derivative.
-    """
-    x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
-    horizontal_m = np.hypot(x, y)
-    if np.any(horizontal_m == 0):
-        raise GeometryError(
-            "a point straight above or below the station has no horizontal angle to differentiate"
-        )
-    distance_m = np.hypot(horizontal_m, z)
-    square = distance_m**2
-    return np.stack(
-        [
-            np.stack([y / horizontal_m**2, -x / horizontal_m**2, np.zeros_like(x)], axis=-1),
-            np.stack(
-                [x * z / (horizontal_m * square), y * z / (horizontal_m * square), -horizontal_m / square],
-                axis=-1,
-            ),
-            np.stack([x / distance_m, y / distance_m, z / distance_m], axis=-1),
-        ],
-        axis=-2,
-    )
 
 
 def measurement_covariance(

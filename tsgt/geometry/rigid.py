@@ -7,19 +7,13 @@ Theory, and Lie Groups", volume 2, section 10.8.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tsgt.errors import GeometryError
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
 FloatArray = NDArray[np.float64]
 
-RIGID_TOLERANCE = 1e-6  # Of R^T R from the identity: a matrix typed with six decimals
 TINY = 1e-300  # Added to a square before a division: changes nothing but zero
 IDENTITY = np.eye(3)
 
@@ -138,31 +132,6 @@ def transform_points(T: FloatArray, points: FloatArray) -> FloatArray:
     """Transform points in m, (..., 3), from frame b to frame a by ``T_a_b``, (..., 4, 4); leading dimensions broadcast."""
     T, points = np.asarray(T, dtype=np.float64), np.asarray(points, dtype=np.float64)
     return rotate(T[..., :3, :3], points) + T[..., :3, 3]
-
-
-def check_transform(T: ArrayLike) -> None:
-    """Check that a matrix is one rigid transform.
-
-    Raises GeometryError: not (4, 4), not finite, last row other than 0 0 0 1, not orthonormal to :data:`RIGID_TOLERANCE`, or
-    a reflection.
-    """
-    matrix = np.asarray(T, dtype=np.float64)
-    if matrix.shape != (4, 4):
-        raise GeometryError(f"a rigid transform has 4x4 numbers, got {'x'.join(map(str, matrix.shape))}")
-    if not np.isfinite(matrix).all():
-        raise GeometryError("a rigid transform has finite numbers only, got NaN or infinity")
-    if not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise GeometryError(f"the last row of a rigid transform is 0 0 0 1, got {matrix[3].tolist()}")
-    R = matrix[:3, :3]
-    error = float(np.abs(R.T @ R - np.eye(3)).max())
-    if error > RIGID_TOLERANCE:
-        raise GeometryError(
-            f"the rotation of a rigid transform is orthonormal, this one deviates by {error:.1e}"
-        )
-    if np.linalg.det(R) < 0:
-        raise GeometryError(
-            "the rotation of a rigid transform is right-handed, this one mirrors: is an axis negated?"
-        )
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -7,20 +7,12 @@ differs for the wheels. Programs for two makes:
 `vectornav` and `xsens` are their codecs, `serial_program` the rest.
 """
 
-from tsgt.imu.lines import FORMAT_VERSION, HelloLine, SamplesLine, StatusLine, decode_program_line
+from tsgt.imu.lines import HelloLine, SamplesLine, StatusLine, decode_program_line
 from tsgt.imu.odometry import WheelOdometry
-from tsgt.imu.odometry_lines import (
-    ODOMETRY_FORMAT_VERSION,
-    OdometryHelloLine,
-    OdometryLine,
-    check_speed,
-    decode_odometry_line,
-)
+from tsgt.imu.odometry_lines import OdometryHelloLine, OdometryLine, decode_odometry_line
 from tsgt.imu.program import Imu
 
 __all__ = [
-    "FORMAT_VERSION",
-    "ODOMETRY_FORMAT_VERSION",
     "HelloLine",
     "Imu",
     "OdometryHelloLine",
@@ -28,7 +20,6 @@ __all__ = [
     "SamplesLine",
     "StatusLine",
     "WheelOdometry",
-    "check_speed",
     "decode_odometry_line",
     "decode_program_line",
 ]

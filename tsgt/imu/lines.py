@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 from pydantic import Field
 
-from tsgt.model import MAX_INSTANT_NS, Vector3
+from tsgt.model import MAX_INSTANT_NS, FiniteNumbers, Vector3
 from tsgt.recording import Typed, decode
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ Limit = Annotated[float, Field(gt=0, le=1e6)] | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DeviceHello:
+class DeviceHello(FiniteNumbers):
     """First line of a program that reads a device: identity of the device, rate of its samples.
 
     Attributes
@@ -49,8 +49,6 @@ class DeviceHello:
     clock
         Name of the device's clock or counter, for people.
     """
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["hello"] = "hello"
     make: str
@@ -77,15 +75,31 @@ class HelloLine(DeviceHello):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SamplesLine:
-    """Consecutive samples: lists with one entry per sample."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
+class DeviceSamples(FiniteNumbers):
+    """Consecutive samples of any device: lists with one entry per sample."""
 
     type: Literal["samples"] = "samples"
     counter: Counts = None
     instrument_time_ns: Counts = None
     host_time_ns: Counts = None
+
+    def __len__(self) -> int:
+        return len(self.counter or self.instrument_time_ns or ())
+
+    def _check_lists(self, *values: Sequence[object] | None) -> None:
+        """Reject samples without time, and lists of different lengths; ``values``: the lists of what was measured."""
+        if self.counter is None and self.instrument_time_ns is None:
+            raise ValueError("neither counter nor instrument_time_ns, without which samples have no time")
+        lists = (self.counter, self.instrument_time_ns, self.host_time_ns, *values)
+        lengths = {len(each) for each in lists if each is not None}
+        if len(lengths) > 1 or 0 in lengths:
+            raise ValueError("the lists have different lengths, or none has an entry")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SamplesLine(DeviceSamples):
+    """Those of an IMU."""
+
     angular_rate_radps: Vectors = None
     delta_angle_rad: Vectors = None
     specific_force_mps2: Vectors = None
@@ -93,35 +107,17 @@ class SamplesLine:
 
     def __post_init__(self) -> None:
         """Reject lines that leave time or motion open, and values that have another unit."""
-        if self.counter is None and self.instrument_time_ns is None:
-            raise ValueError("neither counter nor instrument_time_ns, without which samples have no time")
+        self._check_lists(
+            self.angular_rate_radps, self.delta_angle_rad, self.specific_force_mps2, self.delta_velocity_mps
+        )
         if (self.angular_rate_radps is None) == (self.delta_angle_rad is None):
             raise ValueError("expected either angular_rate_radps or delta_angle_rad")
         if (self.specific_force_mps2 is None) == (self.delta_velocity_mps is None):
             raise ValueError("expected either specific_force_mps2 or delta_velocity_mps")
-        given: list[Sequence[object]] = [
-            each
-            for each in (
-                self.counter,
-                self.instrument_time_ns,
-                self.host_time_ns,
-                self.angular_rate_radps,
-                self.delta_angle_rad,
-                self.specific_force_mps2,
-                self.delta_velocity_mps,
-            )
-            if each is not None
-        ]
-        lengths = {len(each) for each in given}
-        if len(lengths) > 1 or 0 in lengths:
-            raise ValueError("the lists have different lengths, or none has an entry")
         if self.angular_rate_radps is not None:
             check_angular_rate(self.angular_rate_radps)
         if self.specific_force_mps2 is not None:
             check_specific_force(self.specific_force_mps2)
-
-    def __len__(self) -> int:
-        return len(self.counter or self.instrument_time_ns or ())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,7 +156,8 @@ def decode_device_line(
     if kind == "hello" and (found := getattr(decode(_Versioned, data), device)) not in (None, version):
         name = {"imu": "an IMU", "odometry": "odometry"}[device]
         raise FormatVersionError(
-            f"uses version {found} of the lines of {name}, and this master version {version}"
+            f"prints version {found} of the line format of {name}; this master supports version {version}: update the older "
+            "of the two"
         )
     return decode(kinds[kind], data) if kind in kinds else None
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated
 
 from pydantic import Field
 
-from tsgt.imu.lines import MAX_SAMPLES_PER_LINE, Counts, DeviceHello, StatusLine, decode_device_line
+from tsgt.imu.lines import MAX_SAMPLES_PER_LINE, DeviceHello, DeviceSamples, StatusLine, decode_device_line
 
 ODOMETRY_FORMAT_VERSION = 1  # changes when a master of the old version would misunderstand the new one
 
@@ -34,15 +34,9 @@ class OdometryHelloLine(DeviceHello):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OdometryLine:
-    """Consecutive samples: lists with one entry per sample."""
+class OdometryLine(DeviceSamples):
+    """Those of wheel odometry."""
 
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
-
-    type: Literal["samples"] = "samples"
-    counter: Counts = None
-    instrument_time_ns: Counts = None
-    host_time_ns: Counts = None
     speed_mps: Numbers = None
     distance_m: Numbers = None
     yaw_rate_radps: Numbers = None
@@ -50,30 +44,14 @@ class OdometryLine:
 
     def __post_init__(self) -> None:
         """Reject lines that leave time or motion open, and values that have another unit."""
-        if self.counter is None and self.instrument_time_ns is None:
-            raise ValueError("neither counter nor instrument_time_ns, without which samples have no time")
+        self._check_lists(self.speed_mps, self.distance_m, self.yaw_rate_radps, self.valid)
         if (self.speed_mps is None) == (self.distance_m is None):
             raise ValueError("expected either speed_mps or distance_m")
-        lists = (
-            self.counter,
-            self.instrument_time_ns,
-            self.host_time_ns,
-            self.speed_mps,
-            self.distance_m,
-            self.yaw_rate_radps,
-            self.valid,
-        )
-        lengths = {len(each) for each in lists if each is not None}
-        if len(lengths) > 1 or 0 in lengths:
-            raise ValueError("the lists have different lengths, or none has an entry")
         for speed in self.speed_mps or ():
             check_speed(speed)
         for rate in self.yaw_rate_radps or ():
             if abs(rate) > MAX_YAW_RATE_RADPS:
                 raise ValueError(f"a yaw rate of {rate:g}; expected rad/s, at most {MAX_YAW_RATE_RADPS:g}")
-
-    def __len__(self) -> int:
-        return len(self.counter or self.instrument_time_ns or ())
 
 
 OdometryProgramLine = OdometryHelloLine | OdometryLine | StatusLine

@@ -220,7 +220,7 @@ class Imu(DeviceProgram):
             self._clock_steps = self._sampler.clock_steps
             self._on_event(
                 "imu_clock_stepped",
-                "the clock of the IMU has been set or has begun again; its times are fitted anew",
+                "the clock of the IMU has been set or has begun again; its times are fitted again",
             )
 
     async def _check(self) -> NoReturn:

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
 from tsgt.imu.device_clock import DeviceClock
-from tsgt.imu.lines import SamplesLine, check_angular_rate, check_specific_force
+from tsgt.imu.lines import DeviceSamples, SamplesLine, check_angular_rate, check_specific_force
 from tsgt.imu.sample_times import SampleTimes
 from tsgt.model import ImuSamples
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from tsgt.imu.lines import DeviceHello
     from tsgt.imu.sample_times import SampleTime
     from tsgt.model import Vector3
 
@@ -30,37 +31,7 @@ MAX_AHEAD_NS = 5_000_000
 MAX_PENDING_S = 10.0  # of samples that wait for the fit
 
 
-class DeviceHello(Protocol):
-    """What the first line of any program says."""
-
-    @property
-    def rate_hz(self) -> float:
-        """Nominal rate of the samples."""
-        ...
-
-
-class DeviceLine(Protocol):
-    """What a line with the samples of any device has."""
-
-    @property
-    def counter(self) -> tuple[int, ...] | None:
-        """Number of each sample."""
-        ...
-
-    @property
-    def instrument_time_ns(self) -> tuple[int, ...] | None:
-        """End of each interval on the clock of the device."""
-        ...
-
-    @property
-    def host_time_ns(self) -> tuple[int, ...] | None:
-        """When each sample was read."""
-        ...
-
-    def __len__(self) -> int: ...
-
-
-LineT = TypeVar("LineT", bound=DeviceLine)
+LineT = TypeVar("LineT", bound=DeviceSamples)
 RecordT = TypeVar("RecordT")
 
 

@@ -126,7 +126,7 @@ class ImuSession:
         try:
             return self._decode_line(line)
         except FormatVersionError as error:
-            self._fail(f"the program {error}; use one for this version")
+            self._fail(f"the program {error}")
         except ValueError as error:
             self._rejected.add(str(error), line)
         return None

@@ -24,10 +24,17 @@ from tsgt.imu import Imu, WheelOdometry
 from tsgt.master.alarms import Alarms
 from tsgt.master.classic import ClassicLink
 from tsgt.master.link_events import MasterEvent
-from tsgt.master.monitors import GeofenceObserver, ImuUseMonitor, OdometryUseMonitor, layout_monitor
+from tsgt.master.monitors import (
+    GeofenceObserver,
+    ImuUseMonitor,
+    OdometryUseMonitor,
+    RecordingDisk,
+    disk_status,
+    layout_monitor,
+)
 from tsgt.master.publisher import Observer, Publisher
 from tsgt.master.reacquisition_hints import ReacquisitionHints
-from tsgt.master.recording_thread import RecordingDisk, RecordingThread, disk_status
+from tsgt.master.recording_thread import RecordingThread
 from tsgt.master.reload import reloading, usable_setup
 from tsgt.master.station_events import StationEventDetector
 from tsgt.master.statistics import Statistics

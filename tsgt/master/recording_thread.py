@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from tsgt.errors import RecordingError
-from tsgt.master.monitors import DiskMonitor
-from tsgt.recording import DiskStatus, RecordingStatus
+from tsgt.recording import RecordingStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
-    from tsgt.clock import Clock
-    from tsgt.master.link_events import MasterEvent
     from tsgt.recording.recorder import Recorder
-
-
-DISK_SPACE_PERIOD_NS = 5_000_000_000
 
 
 class RecordingThread:
@@ -91,43 +83,3 @@ class RecordingThread:
         self._recorder.flush()
         with suppress(RecordingError):  # logged by the periodic sync
             self._recorder.sync()
-
-
-class RecordingDisk:
-    """The recording and the space on its disk; ``space`` is None before the first measurement of it."""
-
-    def __init__(
-        self,
-        recording: RecordingThread,
-        path: Path,
-        start_ns: int,
-        disk_status: Callable[[Path], DiskStatus | None],
-    ) -> None:
-        self._recording = recording
-        self._path = path
-        self._monitor = DiskMonitor(start_ns)
-        self._disk_status = disk_status
-        self.space: DiskStatus | None = None
-
-    async def measure_space(self, clock: Clock) -> NoReturn:
-        """Measure the space periodically, in a thread: a disk may not respond."""
-        while True:
-            self.space = await asyncio.to_thread(self._disk_status, self._path.parent)
-            await clock.sleep_until(clock.monotonic_ns() + DISK_SPACE_PERIOD_NS)
-
-    def recording_status(self) -> RecordingStatus:
-        """Return the status of the recording."""
-        return self._recording.status(self._path.name)
-
-    def events(self, now_ns: int) -> list[MasterEvent]:
-        """Return the events of a disk that has filled up, failed or recovered."""
-        return self._monitor.update(now_ns, self.recording_status(), self._recording.error, self.space)
-
-
-def disk_status(directory: Path) -> DiskStatus | None:
-    """Return the space on the disk of a directory; None if it cannot be determined. May wait for the disk."""
-    try:
-        usage = shutil.disk_usage(directory)
-    except OSError:
-        return None
-    return DiskStatus(free_bytes=usage.free, total_bytes=usage.total)

@@ -27,8 +27,6 @@ DRAIN_WINDOW_NS = 60_000_000_000
 MIN_DRAIN_SPAN_NS = 10_000_000_000
 MAX_BACKLOG_SAMPLES = 61  # of a window, one a second
 
-_LOCKED = (Status.OK, Status.LOW_ACCURACY, Status.ANGLE_ONLY)
-
 
 class Statistics:
     """Counts packets, measurements and poses of the stations that it was made for, in their order.
@@ -150,7 +148,7 @@ class _Station:
             age_s=_age_s(self.stamp_ns, now_ns),
             status=self.status,
             prism=self.prism,
-            locked=None if self.status is None else self.status in _LOCKED,
+            locked=None if self.status is None else self.status.has_target,
             last_heard_s=_age_s(self.received_ns, now_ns),
             answering=self.responses[-1] if self.responses else None,
             rate_hz=self._rate_hz(now_ns),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Literal
+from typing import Literal
 
 from tsgt.model.values import FiniteNumbers, Vector3, check_finite, check_instants
 
@@ -24,6 +24,11 @@ class Status(StrEnum):
     def usable(self) -> bool:
         """Whether angles and distance may enter a pose; ``LOW_ACCURACY`` is normal in motion."""
         return self in (Status.OK, Status.LOW_ACCURACY)
+
+    @property
+    def has_target(self) -> bool:
+        """Whether the instrument had a target, so that the angles are valid."""
+        return self.usable or self is Status.ANGLE_ONLY
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,13 +138,11 @@ class ClockSample:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ImuSamples:
+class ImuSamples(FiniteNumbers):
     """Consecutive samples of the robot's IMU, raw: each is the mean over an interval of time.
 
     The lists have one entry per sample; they hold one line of the program that reads the IMU, some 25 ms.
     """
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["imu"] = "imu"
     sequence: int
@@ -171,13 +174,11 @@ class ImuSamples:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OdometrySamples:
+class OdometrySamples(FiniteNumbers):
     """Consecutive samples of the robot's wheel odometry, raw: each is the mean over an interval of time.
 
     The lists have one entry per sample; they hold one line of the program that reads the odometry.
     """
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["odometry"] = "odometry"
     sequence: int

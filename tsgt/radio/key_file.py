@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import itertools
 import os
-import pwd
 import re
 import secrets
 import stat
 from typing import TYPE_CHECKING
 
-from tsgt.config import check_permissions
+from tsgt.config import check_permissions, user_name
 from tsgt.errors import ConfigError, OutputFileError
 from tsgt.radio.superframe.wire import KEY_BYTES
 from tsgt.recording import sync_folder
@@ -53,7 +52,7 @@ def read_key(path: Path, *, owner: int | None = None, make_key: str = MAKE_KEY) 
     except (OSError, ValueError) as error:  # ValueError: a path with a zero byte
         reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"{path}: the key cannot be read ({reason}); it must belong to the user {_user(os.geteuid())}",
+            f"{path}: the key cannot be read ({reason}); it must belong to the user {user_name(os.geteuid())}",
             path=path,
         ) from error
     if len(content) == _MAX_FILE_BYTES or re.fullmatch(rb"\s*[0-9A-Fa-f]{%d}\s*" % _DIGITS, content) is None:
@@ -110,10 +109,10 @@ def check_access(path: Path, status: os.stat_result, owner: int, make_key: str =
     if not stat.S_ISREG(status.st_mode):
         raise ConfigError(f"{path}: not a file; name one made with `{make_key}`", path=path)
     if status.st_uid != owner:
-        user = _user(owner)
+        user = user_name(owner)
         raise ConfigError(
-            f"{path}: belongs to the user {_user(status.st_uid)}, but a key must belong to the user of the program, here "
-            f"{user}; run this as {_user(status.st_uid)}, or `sudo chown {user} {path}`",
+            f"{path}: belongs to the user {user_name(status.st_uid)}, but a key must belong to the user of the program, here "
+            f"{user}; run this as {user_name(status.st_uid)}, or `sudo chown {user} {path}`",
             path=path,
         )
     mode = stat.S_IMODE(status.st_mode)
@@ -122,10 +121,3 @@ def check_access(path: Path, status: os.stat_result, owner: int, make_key: str =
             f"{path}: its mode is {mode:04o}, but only the owner may have access to a key; `chmod 600 {path}`",
             path=path,
         )
-
-
-def _user(uid: int) -> str:
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return str(uid)

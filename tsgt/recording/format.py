@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingHeader:
-    """The first line of a recording, and of each further session in the same file."""
+    """The first line of a recording, and of each further run of the master in the same file."""
 
     type: Literal["recording"] = "recording"
     version: int = FORMAT_VERSION
@@ -38,7 +38,7 @@ class RecordingHeader:
     software: str
     """Name and version of the program that wrote it."""
     created_ns: int
-    """Start of the session, on the Unix clock of the computer that wrote it, in ns."""
+    """Start of the run, on the Unix clock of the computer that wrote it, in ns."""
     source: str
     """Origin of the lines: a program, or the imported files."""
 

@@ -46,7 +46,7 @@ _MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, 
 class Recording:
     """The content of a recording that post-processing needs."""
 
-    header: RecordingHeader  # of the first session
+    header: RecordingHeader  # of the first run of the master
     parameters: Parameters  # the last ones in the file
     measurements: list[Measurement]  # in the order of arrival, with merged ones at their place in the file
     end_ns: int | None

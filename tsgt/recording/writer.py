@@ -32,7 +32,7 @@ class RecordingWriter:
     """Appends lines to a recording, each completely or not at all.
 
     A line is in the kernel when :meth:`write` returns, and on the disk after the next :meth:`sync`. The file is locked:
-    it has one writer at a time. The caller writes the header and the parameters that begin every session. ``path``: a
+    it has one writer at a time. The caller writes the header and the parameters that begin every run of the master. ``path``: a
     new file, or a recording to continue. ``write`` passes bytes to the kernel, and ``sync`` brings them to the disk:
     :func:`os.write` and :func:`os.fsync`, except in simulations. ``size``: length of the file in bytes. ``cut_bytes``: length of the torn line that was cut off the end of the file; 0 when it was
     complete. Raises RecordingError if the file cannot be opened, is not a recording, or another program is writing it.

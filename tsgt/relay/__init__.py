@@ -5,6 +5,6 @@ TCP, numbered and tagged, to readers that have the key (`tsgt.client` and docs/r
 `buffer` and `admission` are sans-I/O.
 """
 
-from tsgt.relay.program import HELD_BYTES, run_relay
+from tsgt.relay.program import run_relay
 
-__all__ = ["HELD_BYTES", "run_relay"]
+__all__ = ["run_relay"]

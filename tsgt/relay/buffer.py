@@ -49,11 +49,6 @@ class LineBuffer:
         """Number of the oldest line that is held; :attr:`next` if none is."""
         return self.next - len(self._held)
 
-    @property
-    def held_bytes(self) -> int:
-        """Bytes of the frames that are held."""
-        return self._bytes
-
     def append(self, line: bytes, now_ns: int) -> None:
         """Add a line, without line end."""
         now_ns = self._at(now_ns)

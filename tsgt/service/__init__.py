@@ -16,16 +16,14 @@ from tsgt.service.daemon import (
     watchdog_interval_s,
 )
 from tsgt.service.log_limiter import LogLimiter
-from tsgt.service.program import END_TIMEOUT_S, Listener, LogStderr, Program, StartProgram, start_process
+from tsgt.service.program import Listener, Program, StartProgram, start_process
 from tsgt.service.program_lines import LineSplitter, RejectedLines, printable
 
 __all__ = [
-    "END_TIMEOUT_S",
     "MAX_SOCKET_PATH_BYTES",
     "LineSplitter",
     "Listener",
     "LogLimiter",
-    "LogStderr",
     "Program",
     "RejectedLines",
     "StartProgram",

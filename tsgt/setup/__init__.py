@@ -9,7 +9,7 @@ units, udev rules, the user, the journal's settings.
 from tsgt.setup.answers import NO_INSTRUMENT, MasterAnswers, RadioAnswers, StationAnswers, of_mission
 from tsgt.setup.configuration import ConfigurationState, State, compare_configuration
 from tsgt.setup.mission import Mission, MissionError, decode_mission, encode_mission, hand_over_lines
-from tsgt.setup.probe import FoundInstrument, Ports, WiringSearch, find_instruments, find_radio
+from tsgt.setup.probe import DEFAULT_BAUD, FoundInstrument, Ports, WiringSearch, find_instruments, find_radio
 from tsgt.setup.steps import (
     CLIENT,
     KEY,
@@ -32,6 +32,7 @@ from tsgt.setup.template import client_text, master_text
 
 __all__ = [
     "CLIENT",
+    "DEFAULT_BAUD",
     "KEY",
     "MASTER",
     "NO_INSTRUMENT",

@@ -1,7 +1,7 @@
 """The text that takes a mission's channel and key from the master to its stations, as a file, a QR code, or typed. Sans-I/O.
 
 All radios of a mission need the same modem settings and the same key; a station that gets them in one piece cannot have
-one of them wrong. The text has capitals, digits and ``/``, the compact alphabet of QR codes, and ends with a check sum.
+one of them wrong. The text has capitals, digits and ``/``, the compact alphabet of QR codes, and ends with a checksum.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from tsgt.errors import TsgtError
+from tsgt.radio.superframe.wire import KEY_BYTES
 
 _TAG: Final = "TSGT1"
 _FIELDS: Final = 10
-_KEY_BYTES: Final = 32
 _CHECK_CHARACTERS: Final = 6
 _LINE_GROUPS: Final = 6
 _NO_REGION: Final = "NONE"
@@ -77,16 +77,16 @@ def decode_mission(text: str) -> Mission:
     body = "/".join((*fields, key_text))
     if check != _check_sum(body):
         raise MissionError(
-            f"the check sum of the mission's text does not fit: a character is wrong or missing. Scan or copy it again; {_HELP}"
+            f"the checksum of the mission's text does not fit: a character is wrong or missing. Scan or copy it again; {_HELP}"
         )
     try:
         key = base64.b32decode(key_text + "=" * (-len(key_text) % 8))
         frequency_hz, bandwidth_hz, spreading_factor, coding_rate, preamble, sync_word = map(int, fields[2:])
     except ValueError as error:
         raise MissionError(f"the text of the mission has impossible parts ({error}); {_HELP}") from error
-    if len(key) != _KEY_BYTES:
+    if len(key) != KEY_BYTES:
         raise MissionError(
-            f"the key in the text of the mission has {len(key)} bytes, not {_KEY_BYTES}; {_HELP}"
+            f"the key in the text of the mission has {len(key)} bytes, not {KEY_BYTES}; {_HELP}"
         )
     return Mission(
         region=None if fields[1] == _NO_REGION else fields[1],

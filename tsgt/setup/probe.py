@@ -134,7 +134,7 @@ def _wiring_text(candidate: WiringConfig) -> str:
 
 
 async def find_instruments(
-    ports: Sequence[Path | TcpAddress], access: Ports, clock: Clock, *, baud: int = DEFAULT_BAUD
+    ports: Sequence[Path | TcpAddress], access: Ports, clock: Clock
 ) -> tuple[list[FoundInstrument], dict[Path | TcpAddress, str]]:
     """Ask for an instrument at each port, at all common baud rates, which takes ten seconds for a silent port.
 
@@ -151,7 +151,7 @@ async def find_instruments(
             silent[port] = f"it is open in {holder}"
             continue
         try:
-            connection = await connect(access.open_port(port), baud, clock, checksum=False)
+            connection = await connect(access.open_port(port), DEFAULT_BAUD, clock, checksum=False)
         except InstrumentError as error:
             silent[port] = str(error)
             continue

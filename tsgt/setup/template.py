@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from tsgt.setup.answers import MasterAnswers, RadioAnswers, StationAnswers
 
-_MARK: Final = "# Check sum of what setup wrote: "
+_MARK: Final = "# Checksum of what setup wrote: "
 
 
 def client_text(answers: StationAnswers) -> str:
@@ -103,7 +103,7 @@ def _sealed(text: str) -> str:
 
 
 def content_lines(text: str) -> list[str]:
-    """Return the lines of a configuration but for the check sum."""
+    """Return the lines of a configuration but for the checksum."""
     return [line for line in text.splitlines() if not line.startswith(_MARK)]
 
 

@@ -67,8 +67,6 @@ class OdometrySamples:
     arrival_s: NDArray[np.float64]  # (N,) at the host
     speed_mps: NDArray[np.float64]  # (N,) of the robot's origin along its x axis, positive forwards
     yaw_rate_radps: NDArray[np.float64]  # (N,) about the robot's z axis, positive to the left
-    true_speed_mps: NDArray[np.float64]  # (N,)
-    true_yaw_rate_radps: NDArray[np.float64]  # (N,)
 
     def select(self, rows: NDArray[np.bool_]) -> OdometrySamples:
         """Return the samples of some rows."""
@@ -104,8 +102,6 @@ def simulate_odometry(
         np.maximum.accumulate(time_s + delay_s),
         scale[:, 0] * speed + model.speed_noise_mps * noise[0],
         scale[:, 1] * yaw_rate + model.yaw_rate_noise_radps * noise[1],
-        speed,
-        yaw_rate,
     )
     for condition in conditions:
         samples = _under(condition, samples)

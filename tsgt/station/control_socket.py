@@ -57,8 +57,8 @@ class ControlSocket:
     the socket, or it cannot be created.
     """
 
-    def __init__(self, path: Path, *, mode: int = 0o660) -> None:
-        self._listener = UnixListener(path, mode)
+    def __init__(self, path: Path) -> None:
+        self._listener = UnixListener(path, 0o660)
         self._listener.socket.setblocking(False)
 
     def __enter__(self) -> Self:

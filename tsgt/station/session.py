@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from tsgt.model import PolarMeasurement, Status
+from tsgt.model import PolarMeasurement
 from tsgt.radio import Command, DirectCommand, MeasureCommand, SearchCommand, TrackCommand
 from tsgt.recording.journal import TargetRecord
 from tsgt.station.status import ClientStatus, LastMeasurement
@@ -134,7 +134,7 @@ class ClientSession:
             settings=settings,
             mode=self.mode,
             prism=self.prism,
-            locked=None if last is None else last.status.usable or last.status is Status.ANGLE_ONLY,
+            locked=None if last is None else last.status.has_target,
             last=None
             if last is None
             else LastMeasurement(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import tsgt
-from tsgt.model import Status, check_instants
+from tsgt.model import FiniteNumbers, Status, check_instants
 from tsgt.recording.journal import InstrumentRecord  # noqa: TC001 (pydantic resolves annotations at run time)
 
 Mode = Literal["tracking", "direct"]
@@ -33,7 +33,7 @@ class LinkStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LastMeasurement:
+class LastMeasurement(FiniteNumbers):
     """The last measurement of the instrument.
 
     Attributes
@@ -49,8 +49,6 @@ class LastMeasurement:
         none.
     """
 
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
-
     age_s: float
     prism: int | None
     horizontal_angle_rad: float
@@ -60,7 +58,7 @@ class LastMeasurement:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClientStatus:
+class ClientStatus(FiniteNumbers):
     """The current status of a station's client.
 
     Attributes
@@ -126,8 +124,6 @@ class ClientStatus:
     clock_bound_ns
         Bound on the error of the master's time; null before the first synchronisation.
     """
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["client_status"] = "client_status"
     version: str = tsgt.__version__

@@ -180,7 +180,7 @@ class BeaconClock:
         sigma_ns
             One sigma of ``received_ns``, as the radio claims it.
         unambiguous
-            The session time is from a session part, and not from :meth:`unwrap`.
+            The session time is from a session item, and not from :meth:`unwrap`.
         live
             The master has received the response to this beacon, so it was not replayed.
         """

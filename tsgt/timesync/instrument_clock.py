@@ -141,11 +141,6 @@ class InstrumentClock:
         return self._samples
 
     @property
-    def skew_ppm(self) -> float:
-        """Skew of the host's clock against the instrument's; positive: the host's runs faster."""
-        return self._skew * 1e6
-
-    @property
     def sigma_ns(self) -> float:
         """One sigma of the newest times; infinite before initialisation."""
         drift = self._skew_sigma * abs(self._newest - self._pivot)

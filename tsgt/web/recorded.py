@@ -18,6 +18,7 @@ from tsgt.recording import (
     encode_line,
     read_lines,
 )
+from tsgt.recording.format import HEADER_START
 from tsgt.web.mission.findings import kind
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 _RECEIVED = re.compile(rb'"received_ns":(\d{1,19})')
 _STAMP = re.compile(rb'"stamp_ns":(\d{1,19})')
-_HEADER_START = b'{"type":"recording",'
 _PARAMETERS_START = b'{"type":"parameters",'
 _EVENT_START = b'{"type":"event",'
 _POSE_START = b'{"type":"pose",'
@@ -70,7 +70,7 @@ class Timeline:
                 self.session_ns = at_ns
             self.unix_ns = at_ns
             self.at_s = max(self.at_s, self.session_s + (at_ns - self.session_ns) / 1e9)
-        elif line.startswith(_HEADER_START) and self.session_ns is not None:
+        elif line.startswith(HEADER_START) and self.session_ns is not None:
             self.session_s, self.session_ns = self.at_s + BETWEEN_SESSIONS_S, None
         return self.at_s
 

@@ -10,9 +10,10 @@ from harness.files.records import HEADER, SECOND, START
 from harness.inertial.inertial_drive import InertialDrive, imu_parameters, inertial_drive
 from scipy.spatial.transform import Rotation
 
-from tsgt.geometry import quaternion_from_rotation, rotation_from_quaternion
+from tsgt.geometry import exp_so3, quaternion_from_rotation, rotation_from_quaternion
 from tsgt.geometry.inertial import Gravity, Mounting
-from tsgt.geometry.inertial_calibration import ImuSetup, in_calibrated_axes
+from tsgt.geometry.inertial_calibration import ImuSetup
+from tsgt.geometry.inertial_calibration.setup import axes_about
 from tsgt.model import ImuSamples, Parameters, PointMeasurement, PrismPosition, StationParameters
 from tsgt.recording import encode_line
 
@@ -82,6 +83,27 @@ def uncalibrated_drive(
     )
     observations = replace(drive.measure(seed=seed), layout=drive.layout - centroid)
     return UncalibratedDrive(observations, samples, imu, truth, centroid)
+
+
+def in_calibrated_axes(setup: ImuSetup) -> ImuSetup:
+    """Return a set-up that takes samples to the same rates and forces of the robot, in the axes that its calibration defines."""
+    first, second, vertical = axes_about(setup.vertical)
+    direction = setup.gyro_matrix @ vertical
+    direction = direction / np.linalg.norm(direction)
+    turn = exp_so3(np.cross(vertical, direction))
+    turn = turn @ exp_so3(np.cross(vertical, turn.T @ direction))
+    aligned = turn.T @ setup.accelerometer_matrix
+    angle = np.arctan2(
+        second @ aligned @ first - first @ aligned @ second,
+        first @ aligned @ first + second @ aligned @ second,
+    )
+    turn = turn @ exp_so3(angle * vertical)
+    return replace(
+        setup,
+        mounting=Mounting(setup.mounting.rotation @ turn, setup.mounting.position),
+        gyro_matrix=turn.T @ setup.gyro_matrix,
+        accelerometer_matrix=turn.T @ setup.accelerometer_matrix,
+    )
 
 
 def on_flat_ground(drive: InertialDrive) -> InertialDrive:

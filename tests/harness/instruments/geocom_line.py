@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from tsgt.errors import InstrumentError
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.station.serial import Chunk
+from tsgt.station.serial.chunk_queue import ChunkQueue
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
@@ -149,13 +150,11 @@ class MemoryPort:
         self._instrument = instrument
         self._clock = clock
         self._sent = b""
-        self._chunks: deque[Chunk] = deque()
-        self._came = asyncio.Event()
-        self._gone = False
+        self._received = ChunkQueue()
 
     def write(self, data: bytes) -> None:
         """Send to the instrument."""
-        self._check()
+        self._received.check()
         if self.baud != self._instrument.baud:
             if self._instrument.garbles:
                 self.come(REPLY_S, b"\xfe\x80\r\x7f\n\xff")
@@ -172,37 +171,24 @@ class MemoryPort:
         asyncio.get_running_loop().call_later(after_s, self._come, data)
 
     def _come(self, data: bytes) -> None:
-        self._chunks.append(Chunk(data, self._clock.monotonic_ns()))
-        self._came.set()
+        self._received.put(Chunk(data, self._clock.monotonic_ns()))
 
     async def read(self) -> Chunk:
         """Return the next bytes."""
-        while not self._chunks:
-            self._check()
-            self._came.clear()
-            await self._came.wait()
-        return self._chunks.popleft()
+        return await self._received.read()
 
     def drain(self) -> bytes:
         """Discard unread data."""
-        self._check()
-        data = b"".join(chunk.data for chunk in self._chunks)
-        self._chunks.clear()
-        return data
+        return self._received.drain()
 
     def unplug(self) -> None:
         """Unplug the cable."""
-        self._gone = True
-        self._came.set()
+        self._received.fail("line: the line is gone")
 
     async def close(self) -> None:
         """Close the port."""
         self.closed = True
         self.unplug()
-
-    def _check(self) -> None:
-        if self._gone:
-            raise InstrumentError("line: the line is gone")
 
 
 @dataclass

@@ -13,6 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from harness.instruments.network_line import PeerKind, SimulatedNetwork
 from harness.instruments.serial_scripts import (
     DRIFT_PPM,
     LATENCY_MS,
@@ -23,13 +24,14 @@ from harness.instruments.serial_scripts import (
 )
 
 from tsgt.config import TcpAddress
-from tsgt.simulation.instrument import PeerKind, SimulatedNetwork
 from tsgt.simulation.kernel import DriftingClock, VirtualClock, VirtualTimeline, run_virtual
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from tsgt.simulation.instrument import NetworkFaults, SimulatedTotalStation
+    from harness.instruments.network_line import NetworkFaults
+
+    from tsgt.simulation.instrument import SimulatedTotalStation
     from tsgt.station import Reading
 
 AFTER_S: Final = 40.0

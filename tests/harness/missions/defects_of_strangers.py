@@ -143,21 +143,6 @@ def hide_outstanding(right: Any) -> dict[str, Any]:
     return {"outstanding": None if right.outstanding is None else 0}
 
 
-def swap_signal(right: Any) -> dict[str, Any]:
-    """Return signal strength and signal-to-noise ratio in each other's place."""
-    return {"rssi_dbm": right.snr_db, "snr_db": right.rssi_dbm}
-
-
-def invert_loss(right: Any) -> dict[str, Any]:
-    """Return the share of answered requests as the loss."""
-    return {"loss": None if right.loss is None else 1 - right.loss}
-
-
-def double_rate(right: Any) -> dict[str, Any]:
-    """Return twice the rate."""
-    return {"rate_hz": None if right.rate_hz is None else 2 * right.rate_hz}
-
-
 def show_neighbours_offset(planting: Planting) -> None:
     """Show each station the clock offset of the next one."""
 
@@ -208,7 +193,6 @@ def omit_events(owner: Any, method: str, name: str) -> Callable[[Planting], None
 
 omit_recovered_station = omit_events(StationEventDetector, "exchange", "station_recovered")
 omit_recovered_disk = omit_events(DiskMonitor, "update", "disk_recovered")
-omit_instrument_status = omit_events(StationEventDetector, "measurement", "instrument_status")
 
 
 # --- Estimation -------------------------------------------------------------------------------------------------
@@ -385,20 +369,3 @@ def send_no_setup_to_late_readers(planting: Planting) -> None:
         return defective
 
     planting.replace_attribute(StreamServer, "_new_reader", new_reader)
-
-
-def send_twice(planting: Planting) -> None:
-    """Send every 200th line twice."""
-    count = 0
-
-    def publish(original: Any) -> Any:
-        def defective(self: Any, line: bytes) -> None:
-            nonlocal count
-            count += 1
-            original(self, line)
-            if count % 200 == 0:
-                original(self, line)
-
-        return defective
-
-    planting.replace_attribute(StreamServer, "publish", publish)

@@ -27,7 +27,13 @@ from tsgt.master.daemon import MasterDependencies, run_through_suspensions
 from tsgt.model import Status
 from tsgt.radio import DirectCommand, SearchCommand, TrackCommand
 from tsgt.radio.classic import ClassicStation, MeasurementMessage, raw_status
-from tsgt.radio.superframe import InstrumentState, QueuedMeasurement, SendQueue, SuperframeStation
+from tsgt.radio.superframe import (
+    COMPOSE_LEAD_NS,
+    InstrumentState,
+    QueuedMeasurement,
+    SendQueue,
+    SuperframeStation,
+)
 from tsgt.radio.superframe.wire import RESTART_SKIP, Authenticator, angle_code
 from tsgt.recording import DiskStatus
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
@@ -279,7 +285,7 @@ async def superframe_client(
             await execute_command()
             if received is None or received.slot_ns is None:
                 continue
-            await clock.sleep_until(received.slot_ns - 6_000_000)
+            await clock.sleep_until(received.slot_ns - COMPOSE_LEAD_NS)
             reply = station.compose(instrument_state, clock.monotonic_ns())
             if reply is not None:
                 station.sent(await radio.transmit(reply, at_ns=received.slot_ns))

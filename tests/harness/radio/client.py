@@ -25,7 +25,7 @@ from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
 from tsgt.simulation.lora import Air, LinkModel, radio_opener
 from tsgt.simulation.mission import instrument_config
-from tsgt.simulation.mission.run_log import ObservedInstrument
+from tsgt.simulation.mission.observed import ObservedInstrument
 from tsgt.simulation.world import scenario_world
 from tsgt.station import ClientDependencies, run_client
 

@@ -38,8 +38,6 @@ class CableCut:
     gaps: int
     outage_s: float
     """Longest time without an arrival."""
-    resumed_after_s: float
-    """From the repair of the cable to the next arrival."""
     stale_shown_fresh: int
     """Poses that said to be younger than half a second, and were older than a second."""
 
@@ -63,7 +61,6 @@ def cut_cable(folder: Path, cut_s: float, hold_s: float) -> CableCut:
         pair.cable(plugged=False)
         time.sleep(cut_s)
         pair.cable(plugged=True)
-        repaired_ns = time.time_ns()
         following.wait_for_lines(following.lines() + 1)
         time.sleep(2)
     found = Followed.read(following.output)
@@ -76,7 +73,6 @@ def cut_cable(folder: Path, cut_s: float, hold_s: float) -> CableCut:
         told_missing=sum(lines or 0 for lines in found.gaps),
         gaps=len(found.gaps),
         outage_s=max(after - before for before, after in itertools.pairwise(arrived)) / 1e9,
-        resumed_after_s=(min(at for at in arrived if at > repaired_ns) - repaired_ns) / 1e9,
         stale_shown_fresh=sum(
             age < 0.5 and at - stamp > 1_000_000_000
             for age, at, stamp in zip(found.ages_s, arrived, stamps, strict=True)

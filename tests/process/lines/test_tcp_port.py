@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from harness.instruments.leica import leica_config
+from harness.instruments.tcp_line import TcpLine
 
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig, TcpAddress
 from tsgt.errors import InstrumentError
-from tsgt.simulation.instrument import SimulatedTotalStation, TcpLine
+from tsgt.simulation.instrument import SimulatedTotalStation
 from tsgt.simulation.kernel import LoopTimeline
 from tsgt.simulation.world import scenario_world
 from tsgt.station.leica import LeicaInstrument

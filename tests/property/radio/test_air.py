@@ -112,7 +112,7 @@ class StrictListener(RecordingListener):
 def test_arbitrary_traffic(sequence: list[RadioAction], seed: int, loss_db: float) -> None:
     """Arbitrary frames, receivers, cuts and departures raise nothing; every lock ends; nothing is left behind."""
     timeline = VirtualTimeline()
-    link = LinkModel(path_loss=FixedLoss(default_db=loss_db), fading_sigma_db=3.0, rayleigh_fading=True)
+    link = LinkModel(path_loss=FixedLoss(default_db=loss_db), rayleigh_fading=True)
     air = Air(timeline, np.random.default_rng(seed), link)
     listeners = {name: StrictListener() for name in NAMES}
     ports = {name: air.join(listeners[name], name) for name in NAMES}

@@ -20,11 +20,9 @@ def _evidence(
     return HypothesisEvidence(
         hypothesis,
         log_bayes_factor,
-        log_bayes_factor,
         selected,
         np.full(size, 2e-4),
         np.full(size, 1e-4),
-        np.zeros((1, size)),
     )
 
 

@@ -66,7 +66,7 @@ def test_request_is_sent_and_settings_are_printed(tsgt: Tsgt, tmp_path: Path) ->
     assert outcome.out.splitlines() == [
         "set; distances are corrected by",
         "  prism round +0.0 mm",
-        "  air -13.1 ppm",
+        "  atm. -13.1 ppm",
     ]
 
 

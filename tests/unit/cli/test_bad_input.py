@@ -120,7 +120,9 @@ def test_invalid_track_is_rejected(tsgt: Tsgt, files: dict[str, Path], case: str
 def test_missing_track_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:
     """The error names the file."""
     files["track3"].unlink()
-    assert_refused(tsgt, import_arguments(files), files["recording"], "trimble3.csv: No such file")
+    assert_refused(
+        tsgt, import_arguments(files), files["recording"], "trimble3.csv: cannot be read: No such file"
+    )
 
 
 def test_binary_track_is_rejected(tsgt: Tsgt, files: dict[str, Path]) -> None:

@@ -201,7 +201,7 @@ def test_no_changed_byte_is_accepted(data: st.DataObject) -> None:
 
 
 def test_repeated_frames_are_rejected() -> None:
-    """Lines by their number, signs of life by their time."""
+    """Lines by their number, keep-alive frames by their time."""
     relay, link = Relay(), new_link()
     relay.connect(link, 0)
     relay.line(b"{}")

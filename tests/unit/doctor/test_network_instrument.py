@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from harness.hardware.fake_machine import ADAPTER, FakeMachine
 from harness.hardware.radios import running_timeline
+from harness.instruments.network_line import PeerKind, SimulatedNetwork
 
 from tsgt.config import ScenarioConfig
 from tsgt.doctor import Outcome
-from tsgt.simulation.instrument import PeerKind, SimulatedNetwork, SimulatedTotalStation
+from tsgt.simulation.instrument import SimulatedTotalStation
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.world import scenario_world
 

@@ -81,7 +81,7 @@ async def test_webhook_needs_the_whole_drop_in(fake: FakeMachine, removed: str) 
 
 
 async def test_webhook_is_reached_without_a_request(fake: FakeMachine) -> None:
-    """The path is a secret, and not shown; a server that is away is a note: there may be no network at the desk."""
+    """The path is a secret, and not shown; a server that is away is a note: there may be no network indoors."""
     assert fake.service is not None
     fake.service |= DROP_IN
     reached = await found(fake, "alarms_webhook")

@@ -1,18 +1,15 @@
-"""Polar coordinates: axes, both faces, corrections, Jacobians against differences, noise against propagation."""
+"""Polar coordinates: axes, both faces, corrections, noise against propagation."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from tsgt.errors import GeometryError
 from tsgt.geometry import (
-    cartesian_jacobian,
     cartesian_to_polar,
     corrected_angles,
     corrected_distance,
     measurement_covariance,
-    polar_jacobian,
     polar_to_cartesian,
     raw_distance,
 )
@@ -75,32 +72,6 @@ def test_raw_distance_inverts_corrected_distance() -> None:
     np.testing.assert_allclose(raw_distance(corrected_m, constant_m=-0.0344, ppm=-12.0), raw_m, atol=1e-12)
 
 
-def test_polar_jacobian_agrees_with_differences() -> None:
-    """Each column equals central differences of polar_to_cartesian."""
-    polar = np.random.default_rng(1).uniform((0, 0.1, 1), (6.2, 3.0, 100), size=(50, 3))
-    step = 1e-6
-    for column in range(3):
-        shift = step * np.eye(3)[column]
-        numeric = (polar_to_cartesian(*(polar + shift).T) - polar_to_cartesian(*(polar - shift).T)) / (
-            2 * step
-        )
-        # Truncation d step^2 / 6 and rounding d eps / step: below 2e-8 at 100 m.
-        np.testing.assert_allclose(polar_jacobian(*polar.T)[:, :, column], numeric, atol=5e-8)
-
-
-def test_cartesian_jacobian_inverts_polar_jacobian() -> None:
-    """The two Jacobians are inverse away from the vertical."""
-    polar = np.random.default_rng(2).uniform((0, 0.1, 1), (6.2, 3.0, 100), size=(50, 3))
-    product = cartesian_jacobian(polar_to_cartesian(*polar.T)) @ polar_jacobian(*polar.T)
-    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-11)
-
-
-def test_cartesian_jacobian_rejects_the_vertical() -> None:
-    """On the vertical the horizontal angle has no derivative."""
-    with pytest.raises(GeometryError, match="horizontal angle"):
-        cartesian_jacobian([(1.0, 0.0, 0.0), (0.0, 0.0, 5.0)])
-
-
 def test_covariance_is_propagated_from_angles_and_range() -> None:
     """J diag(sigma^2) J' with the horizontal sigma over sin z, plus pointing, gives the same matrix."""
     noise = InstrumentNoise(
@@ -108,7 +79,13 @@ def test_covariance_is_propagated_from_angles_and_range() -> None:
     )
     polar = np.random.default_rng(3).uniform((0, 0.1, 1), (6.2, 3.0, 500), size=(50, 3))
     h, z, d = polar.T
-    J = polar_jacobian(h, z, d)
+    sin_h, cos_h, sin_z, cos_z = np.sin(h), np.cos(h), np.sin(z), np.cos(z)
+    by_angles_and_range = [
+        [-d * sin_z * sin_h, -d * sin_z * cos_h, 0.0 * d],
+        [d * cos_z * cos_h, -d * cos_z * sin_h, -d * sin_z],
+        [sin_z * cos_h, -sin_z * sin_h, cos_z],
+    ]
+    J = np.array(by_angles_and_range).T
     variances = np.stack(
         [(1e-4 / np.sin(z)) ** 2, np.full(50, 1e-4**2), 0.002**2 + (20e-6 * d) ** 2], axis=-1
     )

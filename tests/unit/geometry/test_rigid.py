@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from tsgt.errors import GeometryError
 from tsgt.geometry import (
-    check_transform,
     exp_so3,
     invert,
     log_so3,
@@ -119,27 +118,6 @@ def test_invert_equals_matrix_inverse() -> None:
     """The inverse of each transform is that of its matrix."""
     T = transform_from(RANDOM.as_matrix(), np.random.default_rng(4).normal(size=(500, 3)))
     np.testing.assert_allclose(invert(T), np.linalg.inv(T), atol=1e-13)
-
-
-def test_check_transform_accepts_six_decimals() -> None:
-    """A transform rounded to six decimals passes."""
-    check_transform(np.round(transform_from(RANDOM[7].as_matrix(), np.array([1.0, 2.0, 3.0])), 6))
-
-
-@pytest.mark.parametrize(
-    ("T", "message"),
-    [
-        (np.eye(3), "4x4 numbers, got 3x3"),
-        (np.diag([1, 1, np.nan, 1]), "finite"),
-        (np.diag([1, 1, 1, 2]), "last row"),
-        (np.diag([1, 1, 1.001, 1]), "orthonormal"),
-        (np.diag([1, 1, -1, 1]), "mirrors"),
-    ],
-)
-def test_check_transform_names_the_violation(T: np.ndarray, message: str) -> None:
-    """Wrong shape, NaN, a wrong last row, a scaled axis and a mirrored axis are each named."""
-    with pytest.raises(GeometryError, match=message):
-        check_transform(T)
 
 
 def right_jacobian(turn: np.ndarray) -> np.ndarray:

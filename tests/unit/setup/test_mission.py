@@ -70,7 +70,7 @@ def test_messages_say_what_to_do() -> None:
     for text, told in (
         (MISSION.key.hex(), "begins with TSGT1/"),
         (TEXT[:40], "not complete"),
-        (TEXT[:-1] + ("A" if TEXT[-1] != "A" else "C"), "check sum"),
+        (TEXT[:-1] + ("A" if TEXT[-1] != "A" else "C"), "checksum"),
     ):
         with pytest.raises(MissionError, match=told) as caught:
             decode_mission(text)

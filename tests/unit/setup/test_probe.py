@@ -1,4 +1,4 @@
-"""The radio is found behind the real back ends, with each of its wirings."""
+"""The radio is found behind the real backends, with each of its wirings."""
 
 from __future__ import annotations
 

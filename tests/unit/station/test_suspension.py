@@ -13,6 +13,7 @@ import pytest
 from harness.hardware.radios import PAPER, running_timeline
 from harness.instruments.bridge import COMMANDS, HELLO, FakeStart
 from harness.instruments.leica import leica_bench, leica_config
+from harness.instruments.network_line import SimulatedNetwork
 from harness.instruments.scripted_instrument import READING, RECORD, ScriptedInstrument
 from harness.radio.client import client_config
 from structlog.testing import capture_logs
@@ -23,7 +24,6 @@ from tsgt.model import Status
 from tsgt.radio import Packet
 from tsgt.recording import read_lines
 from tsgt.recording.journal import load_journal
-from tsgt.simulation.instrument import SimulatedNetwork
 from tsgt.simulation.instrument.total_station import BOOT_NS
 from tsgt.simulation.kernel import DriftingClock, VirtualClock
 from tsgt.station import ClientDependencies, run_client

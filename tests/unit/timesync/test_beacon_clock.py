@@ -269,7 +269,7 @@ def test_large_jump_requires_an_unambiguous_sample() -> None:
 
 
 def test_unwrapping_follows_a_jump_beyond_16_bits() -> None:
-    """After a computer slept for a minute, the next session part starts a new segment."""
+    """After a computer slept for a minute, the next session item starts a new segment."""
     clock, slept_us = clock_with(150), -60_000_000
     for k in range(150, 160):
         local_ns = received_ns(sent_us(k) + slept_us + 60_000_000 * 2)

@@ -76,7 +76,7 @@ def assess(
     Parameters
     ----------
     relation
-        What stands between both: fitted, or known.
+        The relation between estimate and reference: fitted, or known.
     aligned
         Whether the relation's frame was found from these poses: the part of the reference's uncertainty that all poses share
         then does not show in the errors.

@@ -1,4 +1,4 @@
-"""What stands between an estimate and the reference: clock, frame, scale and the point on the robot; and what of it is fitted."""
+"""The relation between an estimate and the reference: clock, extrinsic, frame and scale; and which of these are fitted."""
 
 from __future__ import annotations
 

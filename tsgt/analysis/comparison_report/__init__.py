@@ -4,7 +4,7 @@ Comes in: comparisons of estimates with the reference. Goes out: headline, map a
 """
 
 from tsgt.analysis.comparison_report.headline import comparison_headline
-from tsgt.analysis.comparison_report.notes import component_text, notes
+from tsgt.analysis.comparison_report.notes import notes
 from tsgt.analysis.comparison_report.sections import comparison_map, comparison_sections
 
-__all__ = ["comparison_headline", "comparison_map", "comparison_sections", "component_text", "notes"]
+__all__ = ["comparison_headline", "comparison_map", "comparison_sections", "notes"]

@@ -168,7 +168,7 @@ def _relations(found: Sequence[Comparison]) -> Section:
                 "Rotation vector of the sensor", ("estimate", "x (deg)", "y (deg)", "z (deg)"), tuple(turns)
             )
         )
-    return Section("What stands between estimate and reference", tables=tuple(tables))
+    return Section("Relation between estimate and reference", tables=tuple(tables))
 
 
 def _with_sigma(value: float, sigma: float, digits: int) -> str:

@@ -5,21 +5,16 @@ uncertainty, confidence and repair. docs/reference/diagnosis.md defines them and
 """
 
 from tsgt.analysis.diagnosis.diagnosis import Diagnosis, diagnose, diagnose_smoothed
-from tsgt.analysis.diagnosis.finding import GEOMETRY, LOCK_LOSS, NOISE, OUTLIERS, TARGETS, Finding
+from tsgt.analysis.diagnosis.finding import GEOMETRY, TARGETS, Finding
 from tsgt.analysis.diagnosis.held_out_finding import HELD_OUT, Part
-from tsgt.geometry.motion_calibration import SetupCause
 
 __all__ = [
     "GEOMETRY",
     "HELD_OUT",
-    "LOCK_LOSS",
-    "NOISE",
-    "OUTLIERS",
     "TARGETS",
     "Diagnosis",
     "Finding",
     "Part",
-    "SetupCause",
     "diagnose",
     "diagnose_smoothed",
 ]

@@ -40,15 +40,13 @@ class Analysis:
     causes : Of the set-up, the most evident first.
     effects_m : Of each cause, the displacement of the measured prisms that it causes (rms).
     single : Log Bayes factor of each hypothesis alone, with its estimate and sigma, about the recorded set-up.
-    errors : (G,) most likely errors of the set-up.
-    linearised : At these errors.
+    linearised : At the most likely errors of the set-up.
     """
 
     layout: SetupErrors
     causes: tuple[SelectedCause, ...]
     effects_m: tuple[float, ...]
     single: dict[CauseHypothesis, float]
-    errors: FloatArray
     linearised: LinearisedSetup
     noise: NoiseEstimate
     lock_loss: LockLoss | None
@@ -99,7 +97,6 @@ def analyse(observations: Observations, parameters: Parameters, motion: MotionMo
         causes,
         tuple(_effect_m(linearised, each) for each in causes),
         selection.single(),
-        errors,
         linearised,
         estimate,
         lock_loss,

@@ -13,7 +13,6 @@ from tsgt.analysis.diagnosis.diagnose import analyse
 from tsgt.analysis.diagnosis.finding import setup_findings, with_distances
 from tsgt.analysis.diagnosis.held_out_finding import held_out_finding, held_out_parts
 from tsgt.analysis.diagnosis.noise_findings import noise_findings
-from tsgt.analysis.diagnosis.residual_patterns import residual_patterns
 from tsgt.analysis.diagnosis.target_findings import calibration_findings
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.diagnosis.finding import Finding
     from tsgt.analysis.diagnosis.held_out_finding import Part
-    from tsgt.analysis.diagnosis.residual_patterns import ResidualPattern
     from tsgt.analysis.evaluation import HeldOutErrors, InterPrismDistances, Predictor
     from tsgt.analysis.smoothing import MotionModel, SmoothedRecording
     from tsgt.geometry.trajectory import Observations
@@ -35,15 +33,11 @@ class Diagnosis:
     Attributes
     ----------
     noise : Factors on the stated noise by station and component, with the set-up corrected.
-    single : Log Bayes factor of each cause alone, by its name, the likeliest first.
-    patterns : Of the residuals, with the set-up corrected.
     held_out : Ratios by part of the recording; empty without held-out errors.
     """
 
     findings: tuple[Finding, ...]
     noise: dict[int, tuple[float, ...]]
-    single: dict[str, float]
-    patterns: dict[int, dict[str, ResidualPattern]]
     held_out: tuple[Part, ...] = ()
 
     def numbers(self) -> list[dict[str, Any]]:
@@ -74,15 +68,12 @@ def diagnose(
     findings.sort(key=lambda each: -(50.0 if math.isnan(each.effect_mm) else each.effect_mm))
     parts = held_out_parts(observations, held_out, analysis.layout.prisms) if held_out else []
     worse = held_out_finding(parts, findings)
-    ranked = sorted(analysis.single.items(), key=lambda item: -item[1])
     return Diagnosis(
         tuple(findings if worse is None else [worse, *findings]),
         {
             number: tuple(analysis.noise.factors[row].tolist())
             for row, number in enumerate(analysis.layout.stations)
         },
-        {f"{each.cause} {each.number}": value for each, value in ranked},
-        residual_patterns(analysis.linearised, analysis.noise.normalised, analysis.layout.stations),
         tuple(parts),
     )
 

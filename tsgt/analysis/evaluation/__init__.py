@@ -6,12 +6,10 @@ Goes out: error statistics. docs/reference/evaluate.md defines every figure.
 
 from tsgt.analysis.evaluation.ate_rpe import (
     ErrorSummary,
-    RelativeErrors,
     TransformErrors,
     absolute_errors,
     pairs_by_path,
     pairs_by_time,
-    relative_error_table,
     relative_errors,
 )
 from tsgt.analysis.evaluation.bins import BINS, Bins, Grid, binned, gridded
@@ -19,7 +17,6 @@ from tsgt.analysis.evaluation.error_series import (
     COMPONENTS,
     PoseComponents,
     PoseErrorDetails,
-    component_sigmas,
     error_components,
     error_details,
     pose_components,
@@ -45,7 +42,7 @@ from tsgt.analysis.evaluation.inter_prism import (
     inter_prism,
 )
 from tsgt.analysis.evaluation.live_comparison import LiveComparison, compare_live
-from tsgt.analysis.evaluation.live_poses import AgeBin, LivePoseErrors, LivePoses, LivePoseStatistics
+from tsgt.analysis.evaluation.live_poses import LivePoseErrors, LivePoses
 from tsgt.analysis.evaluation.metrics import (
     Align,
     AlignedErrorStatistics,
@@ -76,13 +73,12 @@ from tsgt.analysis.evaluation.residuals import (
     outliers,
     residual_statistics,
 )
-from tsgt.analysis.evaluation.streamed_poses import StreamedPoses, newest_age_s, read_streamed_poses
+from tsgt.analysis.evaluation.streamed_poses import newest_age_s, read_streamed_poses
 
 __all__ = [
     "BINS",
     "COMPONENTS",
     "PREDICTOR_NAMES",
-    "AgeBin",
     "Align",
     "AlignedErrorStatistics",
     "Bins",
@@ -94,7 +90,6 @@ __all__ = [
     "InterPrismDistances",
     "LiveComparison",
     "LivePoseErrors",
-    "LivePoseStatistics",
     "LivePoses",
     "NeesStatistics",
     "NormalisedErrorStatistics",
@@ -107,17 +102,14 @@ __all__ = [
     "PoseErrors",
     "Predictor",
     "Reference",
-    "RelativeErrors",
     "ResidualStatistics",
     "StationaryStatistics",
-    "StreamedPoses",
     "TransformErrors",
     "absolute_errors",
     "binned",
     "compare",
     "compare_aligned",
     "compare_live",
-    "component_sigmas",
     "cross_validate",
     "distances_at_epochs",
     "error_components",
@@ -140,7 +132,6 @@ __all__ = [
     "pose_errors",
     "read_streamed_poses",
     "read_tum",
-    "relative_error_table",
     "relative_errors",
     "residual_statistics",
     "stationary_errors",

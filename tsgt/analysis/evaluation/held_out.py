@@ -17,12 +17,13 @@ import numpy as np
 
 from tsgt.analysis.evaluation.normalised_prediction import NormalisedErrors, normalised_prediction_errors
 from tsgt.analysis.refinement import refine_recorded_setup
-from tsgt.analysis.smoothing import MIN_PRISMS, estimate_motion_model, recorded_motion_model
+from tsgt.analysis.smoothing import estimate_motion_model, recorded_motion_model
 from tsgt.estimation import centroid_m, noise_scales
 from tsgt.geometry.batch import fit_trajectory, scale_noise
 from tsgt.geometry.inertial import fit_inertial_trajectory
 from tsgt.geometry.motion_calibration import Setup
 from tsgt.geometry.rest import find_rest, in_rest
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

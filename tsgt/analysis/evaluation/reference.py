@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from tsgt.analysis.evaluation.metrics import PoseErrorStatistics, aligned_statistics, interior_mask
+from tsgt.analysis.text_file import read_text
 from tsgt.errors import InputFileError
 from tsgt.estimation import POINT_COMMENT, parse_reference_point, transform_between
 from tsgt.geometry import (
@@ -76,16 +77,10 @@ def read_tum(path: Path) -> Reference:
     A comment ``# reference_point: NAME=X,Y,Z,QX,QY,QZ,QW`` states the point of the poses; without it they are of the robot
     frame. Raises InputFileError if it cannot be read, has fewer than two poses, a line is not a pose, or times do not increase.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # editors of Windows write a byte order mark
-    except OSError as error:
-        raise InputFileError(f"cannot be read: {error.strerror}", path=path) from error
-    except UnicodeDecodeError as error:
-        raise InputFileError("is not a text file", path=path) from error
     stamps: list[int] = []
     rows: list[list[float]] = []
     point = ROBOT_ORIGIN
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         if line.startswith(POINT_COMMENT):
             point = _stated_point(line, path, number)
             continue

@@ -6,7 +6,7 @@ was expected and what was found.
 """
 
 from tsgt.analysis.formats.export import measurement_csv, pose_csv, tum_lines, valid_records, valid_rows
-from tsgt.analysis.formats.imu_files import FileSample, imu_records, read_imu_file
+from tsgt.analysis.formats.imu_files import imu_records, read_imu_files
 from tsgt.analysis.formats.mcap import messages, write_mcap
 from tsgt.analysis.formats.odometry import read_stationary_intervals
 from tsgt.analysis.formats.polar_files import check_tracks, read_polar_tracks, tracked_prisms
@@ -33,7 +33,6 @@ from tsgt.analysis.formats.wheel_files import read_wheel_files, wheel_records
 __all__ = [
     "QUALITIES",
     "SECOND_NS",
-    "FileSample",
     "InstrumentErrors",
     "PosFile",
     "PrismFile",
@@ -47,7 +46,7 @@ __all__ = [
     "measurement_csv",
     "messages",
     "pose_csv",
-    "read_imu_file",
+    "read_imu_files",
     "read_partial_target_file",
     "read_polar_tracks",
     "read_pos",

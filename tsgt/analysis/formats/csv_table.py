@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from typing import TYPE_CHECKING
 
+from tsgt.analysis.text_file import read_text
 from tsgt.errors import InputFileError, quoted
 from tsgt.estimation import MAX_DISTANCE_M
 from tsgt.model import MAX_INSTANT_NS
@@ -20,6 +21,7 @@ RAD_PER_UNIT = {"rad": 1.0, "deg": math.pi / 180, "gon": math.pi / 200}
 
 HORIZONTAL = tuple(f"horizontal_angle_{unit}" for unit in RAD_PER_UNIT)
 ZENITH = tuple(f"zenith_angle_{unit}" for unit in RAD_PER_UNIT)
+TIME = ("stamp_ns", "time_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +110,11 @@ class Row:
             raise self.error(f"{column} is {quoted(self.cells[column])}; expected a Unix time in s")
         return int(time_s.scaleb(9).to_integral_value())
 
+    def stamp_ns(self) -> int:
+        """Parse the Unix time in ns, or in s."""
+        stated_ns = "stamp_ns" in self.cells
+        return self.non_negative_integer("stamp_ns") if stated_ns else self.seconds_ns("time_s")
+
     def angles_rad(self, horizontal: str | None = None, zenith: str | None = None) -> tuple[float, float]:
         """Parse horizontal and zenith angle; the default columns are those whose names end with their unit."""
         horizontal = horizontal or next(name for name in HORIZONTAL if name in self.cells)
@@ -142,15 +149,9 @@ def read_table(path: Path) -> tuple[Header, Iterator[Row]]:
 
     Raises InputFileError if it cannot be read or has no rows; on iteration: if a row has not as many cells as the header.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets write a byte order mark
-    except UnicodeDecodeError as error:
-        raise InputFileError("is not a text file", path=path) from error
-    except OSError as error:
-        raise InputFileError(error.strerror or str(error), path=path) from error
     lines = [
         (number, _cells(line, path, number))
-        for number, line in enumerate(text.splitlines(), start=1)
+        for number, line in enumerate(read_text(path).splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not lines:

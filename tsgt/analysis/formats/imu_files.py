@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.analysis.formats.bag import open_bag
-from tsgt.analysis.formats.csv_table import read_table
+from tsgt.analysis.formats.csv_table import TIME, read_table
 from tsgt.analysis.formats.sample_runs import MIN_SAMPLES, SampleRun, sample_runs
 from tsgt.errors import InputFileError
 from tsgt.model import ImuSamples
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 TABLE_SUFFIX = ".csv"
 
-_TIME = ("stamp_ns", "time_s")
 _RATE = tuple(f"angular_rate_{axis}_radps" for axis in "xyz")
 _FORCE = tuple(f"specific_force_{axis}_mps2" for axis in "xyz")
 _LIMITS = (*((name, 100.0) for name in _RATE), *((name, 2000.0) for name in _FORCE))
@@ -33,17 +32,23 @@ class FileSample(NamedTuple):
     specific_force_mps2: Vector3
 
 
-def read_imu_file(path: Path, topic: str | None = None) -> list[FileSample]:
-    """Read a CSV file or a bag in the order of time; repeated samples are dropped.
+def read_imu_files(paths: Sequence[Path], topic: str | None = None) -> list[FileSample]:
+    """Read CSV files and bags in the order of time; of samples of the same time the last is kept.
 
-    ``topic``: of a bag; default: the only one with IMU messages. Raises InputFileError if the file cannot be used, and
+    ``topic``: of a bag; default: the only one with IMU messages. Raises InputFileError if a file cannot be used, and
     MissingExtraError for a bag without the library rosbags.
     """
-    samples = list(_table(path) if path.suffix == TABLE_SUFFIX else _bag(path, topic))
-    unique = {sample.stamp_ns: sample for sample in samples}
-    if len(unique) < MIN_SAMPLES:
-        raise InputFileError("contains fewer than two samples of an IMU", path=path)
+    unique: dict[int, FileSample] = {}
+    for path in paths:
+        samples = {each.stamp_ns: each for each in _read(path, topic)}
+        if len(samples) < MIN_SAMPLES:
+            raise InputFileError("contains fewer than two samples of an IMU", path=path)
+        unique |= samples
     return [unique[stamp_ns] for stamp_ns in sorted(unique)]
+
+
+def _read(path: Path, topic: str | None) -> Iterable[FileSample]:
+    return _table(path) if path.suffix == TABLE_SUFFIX else _bag(path, topic)
 
 
 def imu_records(samples: Sequence[FileSample], offset_ns: int) -> Iterator[ImuSamples]:
@@ -66,14 +71,11 @@ def _record(run: SampleRun[FileSample], offset_ns: int) -> ImuSamples:
 
 def _table(path: Path) -> Iterator[FileSample]:
     header, rows = read_table(path)
-    header.expect([_TIME, *([name] for name in (*_RATE, *_FORCE))], ())
+    header.expect([TIME, *([name] for name in (*_RATE, *_FORCE))], ())
     for row in rows:
-        stamp_ns = (
-            row.non_negative_integer("stamp_ns") if "stamp_ns" in row.cells else row.seconds_ns("time_s")
-        )
         wx, wy, wz = (row.within(name, -limit, limit) for name, limit in _LIMITS[:3])
         fx, fy, fz = (row.within(name, -limit, limit) for name, limit in _LIMITS[3:])
-        yield FileSample(stamp_ns, (wx, wy, wz), (fx, fy, fz))
+        yield FileSample(row.stamp_ns(), (wx, wy, wz), (fx, fy, fz))
 
 
 def _bag(path: Path, topic: str | None) -> Iterable[FileSample]:

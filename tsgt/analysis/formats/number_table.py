@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from tsgt.analysis.text_file import read_text
 from tsgt.errors import InputFileError, quoted
 from tsgt.model import MAX_INSTANT_NS
 
@@ -84,19 +85,13 @@ def read_number_table(path: Path) -> NumberTable:
     as many words as the row has cells. Raises InputFileError if the file cannot be read, is empty, or a row has another number
     of cells than the first.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputFileError(f"cannot be read: {error.strerror}", path=path) from error
-    except UnicodeDecodeError as error:
-        raise InputFileError("is not a text file", path=path) from error
     names: list[str] | None = None
     header_line: int | None = None
     comment = ""
     rows: list[list[str]] = []
     numbers: list[int] = []
     separator: str | None = None
-    for number, written in enumerate(text.splitlines(), start=1):
+    for number, written in enumerate(read_text(path).splitlines(), start=1):
         line = written.strip()
         if not line:
             continue

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from tsgt.analysis.text_file import read_text
 from tsgt.errors import InputFileError
 from tsgt.model import check_instants
 
@@ -24,17 +25,11 @@ def read_stationary_intervals(path: Path) -> list[tuple[int, int]]:
     semicolons or spaces. The first line may name the columns; ``#`` starts a comment. Raises InputFileError if the file
     cannot be read, a line is not three finite numbers, or times do not increase.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputFileError(f"cannot be read: {error.strerror}", path=path) from error
-    except UnicodeDecodeError as error:
-        raise InputFileError("is not a text file", path=path) from error
     intervals: list[tuple[int, int]] = []
     begin: int | None = None
     last: int | None = None
     first = True
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.split("#", maxsplit=1)[0].replace(",", " ").replace(";", " ").split()
         if not words:
             continue

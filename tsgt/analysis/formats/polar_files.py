@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tsgt.analysis.formats.csv_table import HORIZONTAL, ZENITH, read_table
+from tsgt.analysis.formats.csv_table import HORIZONTAL, TIME, ZENITH, read_table
 from tsgt.errors import InputFileError, quoted
 from tsgt.model import PointMeasurement, PolarMeasurement, Status
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from tsgt.analysis.formats.csv_table import Row
     from tsgt.model import Measurement
 
-_TIME = ("stamp_ns", "time_s")
 _POINT = ("x_m", "y_m", "z_m")
 _OPTIONAL = (
     *("type", "station", "prism", "sequence", "received_ns", "status"),
@@ -36,7 +35,7 @@ def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
     seen: dict[tuple[int, int, int], str] = {}
     for position, path in enumerate(paths, start=1):
         header, rows = read_table(path)
-        header.expect([_TIME, HORIZONTAL, ZENITH, ["slope_distance_m"]], _OPTIONAL)
+        header.expect([TIME, HORIZONTAL, ZENITH, ["slope_distance_m"]], _OPTIONAL)
         for row in rows:
             station = row.positive_integer("station") if "station" in row.cells else position
             found = _measurement(row, station, counts.get(station, 0))
@@ -53,7 +52,7 @@ def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
 
 def _measurement(row: Row, station: int, count: int) -> Measurement:
     """Parse one line; ``count`` is the number of previous lines of this station."""
-    stamp_ns = row.non_negative_integer("stamp_ns") if "stamp_ns" in row.cells else row.seconds_ns("time_s")
+    stamp_ns = row.stamp_ns()
     prism = row.positive_integer("prism") if "prism" in row.cells else station
     sequence = _optional_integer(row, "sequence")
     received_ns = _optional_integer(row, "received_ns")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.text_file import read_text
 from tsgt.errors import DegenerateGeometryError, InputFileError, quoted
 from tsgt.geometry import check_layout
 from tsgt.model import MAX_COORDINATE_M, PrismPosition
@@ -126,13 +127,7 @@ def _read_sensor_positions(path: Path) -> dict[int, Vector3]:
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Return line number and columns of all non-blank lines."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # editors of Windows write a byte order mark
-    except UnicodeDecodeError as error:
-        raise InputFileError("is not a text file", path=path) from error
-    except OSError as error:
-        raise InputFileError(error.strerror or str(error), path=path) from error
-    rows = [(number, line.split()) for number, line in enumerate(text.splitlines(), start=1)]
+    rows = [(number, line.split()) for number, line in enumerate(read_text(path).splitlines(), start=1)]
     return [(number, row) for number, row in rows if row]
 
 

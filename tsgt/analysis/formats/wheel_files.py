@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.analysis.formats.csv_table import read_table
+from tsgt.analysis.formats.csv_table import TIME, read_table
 from tsgt.analysis.formats.sample_runs import MIN_SAMPLES, SampleRun, sample_runs
 from tsgt.errors import InputFileError
 from tsgt.model import OdometrySamples
@@ -57,12 +57,9 @@ def _record(run: SampleRun[WheelSample], offset_ns: int) -> OdometrySamples:
 
 def _table(path: Path) -> Iterator[WheelSample]:
     header, rows = read_table(path)
-    header.expect([("stamp_ns", "time_s"), ("speed_mps",)], ("yaw_rate_radps",))
+    header.expect([TIME, ("speed_mps",)], ("yaw_rate_radps",))
     for row in rows:
-        stamp_ns = (
-            row.non_negative_integer("stamp_ns") if "stamp_ns" in row.cells else row.seconds_ns("time_s")
-        )
         rate = None
         if "yaw_rate_radps" in row.cells:
             rate = row.within("yaw_rate_radps", -_MAX_YAW_RATE_RADPS, _MAX_YAW_RATE_RADPS)
-        yield WheelSample(stamp_ns, row.within("speed_mps", -_MAX_SPEED_MPS, _MAX_SPEED_MPS), rate)
+        yield WheelSample(row.stamp_ns(), row.within("speed_mps", -_MAX_SPEED_MPS, _MAX_SPEED_MPS), rate)

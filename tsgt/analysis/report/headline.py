@@ -52,4 +52,4 @@ def _key_figures(f: Findings) -> Iterator[tuple[str, str]]:
     if f.held_out is not None:
         with_imu = estimator == "continuous" and f.continuous is not None and f.continuous.imu is not None
         mean_mm = f.held_out["continuous_imu" if with_imu else estimator].statistics.mean
-        yield "mean error of predicting left-out measurements of prisms", f"{format_number(mean_mm)} mm"
+        yield "mean error of predicting held-out measurements of prisms", f"{format_number(mean_mm)} mm"

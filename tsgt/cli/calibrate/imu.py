@@ -78,9 +78,11 @@ def imu(
     loaded = calibrated(loaded, recording)
     if noise is not None or gravity_mps2 is not None:
         if noise is None or gravity_mps2 is None:
-            raise click.UsageError("--noise and --gravity-mps2 belong together")
+            raise click.UsageError("give --noise and --gravity-mps2 together")
         if loaded.parameters.imu is not None:
-            raise click.UsageError(f"--noise: {recording} has the parameters of an IMU")
+            raise click.UsageError(
+                f"{recording} already has the parameters of an IMU; omit --noise and --gravity-mps2"
+            )
         unknown = ImuParameters(
             position_m=(0.0, 0.0, 0.0),
             orientation_xyzw=(0.0, 0.0, 0.0, 1.0),

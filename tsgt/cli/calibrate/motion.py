@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.calibration import CalibratedRecording, HeldOutComparison
     from tsgt.analysis.evaluation import HeldOutErrors
-    from tsgt.geometry.motion_calibration import UnobservableDirection
 
 UNKNOWN_SHIFT_M = 10.0
 UNKNOWN_TURN_RAD = 0.2
@@ -128,7 +127,7 @@ def motion(
     else:
         _print(found, stations, positions if estimate_prisms else {}, sigmas)
     for direction in weak:
-        click.echo(f"note: unobservable from this motion (one sigma): {direction.description}", err=True)
+        click.echo(f"note: unobservable from this motion (one sigma): {direction}", err=True)
     comment = f"written by tsgt calibrate motion {recording} --initial-frames {frames} --dof {dof}"
     if output is not None:
         write_station_frames(
@@ -159,11 +158,16 @@ def motion(
         write_prism_layout(prism_output, positions, sigmas, comment=comment)
     judged = found.held_out
     if judged is not None and judged.grown:
-        click.echo("check failed: the held-out prediction error has grown", err=True)
+        click.echo(
+            "check failed: the held-out prediction error is larger than with the recorded set-up; keep the old set-up files "
+            "and see docs/how-to/calibrate-from-motion.md",
+            err=True,
+        )
         return CHECK_FAILED
     if judged is not None and judged.before is not None and judged.grown is None:
         click.echo(
-            "note: the calibration was not judged: no measurement could be held out and predicted", err=True
+            "note: the calibration was not validated: no measurement could be held out and predicted",
+            err=True,
         )
     return 0
 
@@ -212,7 +216,7 @@ def _stations(found: CalibratedRecording) -> dict[int, dict[str, Any]]:
 def _json(
     found: CalibratedRecording,
     stations: dict[int, dict[str, Any]],
-    weak: list[UnobservableDirection],
+    weak: list[str],
     positions: dict[int, Any],
     sigmas: dict[int, Any],
 ) -> dict[str, Any]:
@@ -222,7 +226,7 @@ def _json(
         "prisms": {prism: position.tolist() for prism, position in positions.items()},
         "prism_sigma_mm": {prism: (1e3 * sigma).tolist() for prism, sigma in sigmas.items()},
         "pivot_m": calibration.parameters.pivot.tolist(),
-        "unobservable": [direction.description for direction in weak],
+        "unobservable": weak,
         "measurements": calibration.measurements,
         "outliers": calibration.outliers,
         "noise_scale": calibration.noise_scale,
@@ -298,5 +302,5 @@ def _print_judgement(judged: HeldOutComparison) -> None:
             figures, gaps = predicted.statistics, predicted.gaps
             numbers = (figures.mean, figures.median, figures.p95, gaps.mean)
             rows.append([name, *(f"{number:.2f}" for number in numbers)])
-    title = f"{judged.after.statistics.n} measurements left out, missed by mm"
+    title = f"prediction error of {judged.after.statistics.n} held-out measurements (mm)"
     print_table([title, "mean", "median", "p95", f"mean of {judged.after.gaps.n} in gaps"], rows)

@@ -40,13 +40,10 @@ def import_imu(
     stamp_ns or time_s (Unix time), angular_rate_x_radps, _y_, _z_, and specific_force_x_mps2, _y_, _z_, gravity
     included. Times must be those of the device, not of the arrival: durations are their differences.
     """
-    from tsgt.analysis.formats import imu_records, interval_ns, read_imu_file
+    from tsgt.analysis.formats import imu_records, interval_ns, read_imu_files
 
     refuse_overwrite(files, output)
-    samples = sorted(
-        {each.stamp_ns: each for path in files for each in read_imu_file(path, topic)}.values(),
-        key=lambda sample: sample.stamp_ns,
-    )
+    samples = read_imu_files(files, topic)
     gaps = write_samples(output, "imu", files, imu_records(samples, round(offset_ms * 1e6)))
     rate_hz = 1e9 / interval_ns(samples)
     if as_json:

@@ -202,7 +202,7 @@ def _solved_stations(
     """Solve the station frames from targets, and print notes on them."""
     if prism_constant_mm is None:
         raise click.UsageError(
-            f"--targets needs {PRISM_CONSTANT}: what the instruments had to add to the distances to the prisms"
+            f"--targets needs {PRISM_CONSTANT}, the prism constant that the published positions already contain"
         )
     measured = read_partial_target_file(targets)
     sights = (

@@ -102,7 +102,7 @@ class PartsType(click.ParamType[Any]):
 @click.option(
     "--max-sigma-mm",
     type=FiniteRange(0.0, 1e6, min_open=True),
-    help="Leave out where the reference is less certain than this, one sigma of the sensor's position.",
+    help="Leave out poses at which the reference's sigma of the sensor's position, in its least certain direction, exceeds this.",
 )
 @click.option(
     "--report",
@@ -136,9 +136,10 @@ def compare(
     """Compare estimates of other programs with the reference.
 
     REFERENCE is a recording, or poses of tsgt process. Each ESTIMATE is a TUM, KITTI, EuRoC or CSV file, a ROS 2 bag or an
-    MCAP file, of poses or of positions alone. Fits what stands between both (clock, point on the robot, frame), with
-    uncertainties, and states the errors that remain, beside what the reference's own uncertainty explains. By default only
-    the time offset and the alignment at the start are fitted; the error with everything fitted stands beside it.
+    MCAP file, of poses or of positions alone. Fits the relation between estimate and reference (clock offset, extrinsic
+    of the sensor, frame), with uncertainties, and states the errors that remain, beside what the reference's own
+    uncertainty explains. By default only the time offset and the alignment at the start are fitted; the error with
+    everything fitted stands beside it.
     """
     if report_folder is not None:
         refuse_report([reference, *estimates, extrinsic_path], report_folder)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tsgt.cli.options import path_type, socket_option
+from tsgt.client.relay_wire import DEFAULT_PORT
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,8 +28,6 @@ class _AddressType(click.ParamType["tuple[str, int]"]):
     ) -> tuple[str, int]:
         """Parse ``ADDRESS``, ``ADDRESS:PORT``, ``[IPV6]:PORT``."""
         import ipaddress
-
-        from tsgt.client.relay_wire import DEFAULT_PORT
 
         match = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::(\d{1,5}))?|([0-9a-fA-F:]+)", str(value))
         try:
@@ -77,7 +76,7 @@ def _make_key(ctx: click.Context, param: click.Parameter, path: Path | None) -> 
 @click.option(
     "--listen",
     type=_AddressType(),
-    default=f"{LOOPBACK}:27690",
+    default=f"{LOOPBACK}:{DEFAULT_PORT}",
     metavar="ADDRESS[:PORT]",
     help="Address of this computer that readers connect to; 0.0.0.0: any.",
 )
@@ -116,7 +115,7 @@ def relay(
     from tsgt.relay import run_relay
 
     if (certificate is None) != (private_key is None):
-        raise click.UsageError("--certificate and --private-key are given together")
+        raise click.UsageError("give --certificate and --private-key together")
     key = read_key(key_path, make_key=MAKE_KEY)
     tls = None
     if certificate is not None and private_key is not None:

@@ -93,7 +93,7 @@ def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:
         problems += [] if ok else [f"IMU: {label}"]
     if record.odometry is not None:
         label, ok = odometry_label(record.odometry)
-        blocks.append([_headline(f"WHEELS  {label}", ok=ok), *_odometry_lines(record.odometry)])
+        blocks.append([_headline(f"ODOMETRY  {label}", ok=ok), *_odometry_lines(record.odometry)])
         problems += [] if ok else [f"wheel odometry: {label}"]
     if record.recording is not None:
         block, ok = _recording_block(record.recording, record.disk, record.stamp_ns)
@@ -170,9 +170,9 @@ def odometry_label(odometry: OdometryStatus) -> tuple[str, bool]:
     if odometry.age_s > MAX_IMU_AGE_S:
         return f"SILENT {duration(odometry.age_s)}", False
     if odometry.problem:
-        return "CHECK THEM", False
+        return "CHECK IT", False
     if odometry.use == "disagrees":
-        return "DISAGREE WITH IMU AND PRISMS", False
+        return "DISAGREES WITH IMU AND PRISMS", False
     return ("NOT IN USE: NO IMU" if odometry.use == "without_imu" else "OK"), True
 
 
@@ -203,7 +203,7 @@ def station_label(station: StationStatus) -> tuple[str, bool]:
         return "NO MEASUREMENT YET", False
     # The station responds, but always with the same measurement.
     if station.status.usable and station.age_s - station.last_heard_s > MAX_AGE_S:
-        return f"OLD {duration(station.age_s)}", False
+        return f"NO MEASUREMENT FOR {duration(station.age_s)}", False
     return LABELS[station.status], station.status.usable
 
 
@@ -233,7 +233,7 @@ def _station_lines(station: StationStatus) -> list[str]:
     if station.battery_percent is not None:
         lines.append(f"  battery {station.battery_percent} %")
     if station.atmospheric_ppm is not None:
-        lines.append(f"  air {station.atmospheric_ppm:+.1f} ppm")
+        lines.append(f"  atm. {station.atmospheric_ppm:+.1f} ppm")
     if station.activity and station.activity != "tracking":
         lines += wrapped(station.activity, "  ")
     if station.problem:
@@ -305,7 +305,7 @@ def setting_lines(settings: InstrumentRecord) -> list[str]:
     if settings.prism_constant_m is not None:
         lines.append(f"  prism {printable(settings.prism_type)} {1e3 * settings.prism_constant_m:+.1f} mm")
     if settings.atmospheric_ppm is not None:
-        air = f"  air {settings.atmospheric_ppm:+.1f} ppm"
+        air = f"  atm. {settings.atmospheric_ppm:+.1f} ppm"
         if settings.temperature_c is not None and settings.pressure_hpa is not None:
             air += f": {settings.temperature_c:.1f} C, {settings.pressure_hpa:.1f} hPa"
         lines.append(air)
@@ -355,7 +355,9 @@ def _client_problems(record: ClientStatus) -> list[str]:
         problems.append("CHECK THE INSTRUMENT")
     if record.instrument is not None and record.mode == "tracking":
         if last is None or (last.status.usable and last.age_s > MAX_AGE_S):
-            problems.append("NO MEASUREMENT" if last is None else f"OLD {duration(last.age_s)}")
+            problems.append(
+                "NO MEASUREMENT" if last is None else f"NO MEASUREMENT FOR {duration(last.age_s)}"
+            )
         elif not last.status.usable:
             problems.append(LABELS[last.status])
     if not record.journal_ok:

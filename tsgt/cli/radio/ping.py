@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 import secrets
 from contextlib import aclosing, suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
 
     from tsgt.clock import Clock
-    from tsgt.radio.ping import SignalStrength
+    from tsgt.radio.ping import SignalStrength, Summary
 
     Session = Callable[[SX127x, Clock], Awaitable[None]]
 
@@ -179,40 +179,44 @@ def ping_command(
         statistics = _on_hardware(session, settings, wiring)
     summary = summarise(exchanges)
     if as_json:
-        print_json(
-            {
-                "simulated": simulated,
-                "airtime_ms": airtime_ms,
-                "sent": summary.sent,
-                "received": summary.received,
-                "loss": summary.loss,
-                "late": summary.late,
-                "unknown_packets": summary.unknown,
-                "crc_errors": statistics.crc_errors,
-                "lost_edges": statistics.lost_edges,
-                "packets_per_s": summary.packets_per_s,
-                "here": summary.local and summary.local._asdict(),
-                "there": summary.remote and summary.remote._asdict(),
-                "round_trip_ms": _times(summary.round_trip_ns),
-                "turnaround_ms": _times(summary.turnaround_ns),
-            }
-        )
+        print_json({"simulated": simulated, "airtime_ms": airtime_ms, **_summary_json(summary, statistics)})
     else:
-        loss = "" if summary.loss is None else f", {summary.loss:.1%} lost"
-        rate = "" if summary.packets_per_s is None else f", {summary.packets_per_s:.2f} packets/s both ways"
         click.echo(
             f"sent         {summary.sent} requests of {payload_bytes} bytes, {airtime_ms:.3f} ms on air"
         )
-        click.echo(f"received     {summary.received} replies{loss}{rate}")
-        click.echo(
-            f"rejected     {summary.late} late replies, {summary.unknown} unknown packets, "
-            f"{statistics.crc_errors} with a wrong CRC, {statistics.lost_edges} edges lost"
-        )
-        click.echo(f"replies      {_strength_text(summary.local)}")
-        click.echo(f"requests     {_strength_text(summary.remote)}, at the other side")
-        click.echo(f"round trip   {_times_text(summary.round_trip_ns)}, TxDone to RxDone")
-        click.echo(f"turnaround   {_times_text(summary.turnaround_ns)}, RxDone to start of the reply, there")
+        _print_summary(summary, statistics)
     return 0 if summary.received else CHECK_FAILED
+
+
+def _summary_json(summary: Summary, statistics: RadioStatistics) -> dict[str, Any]:
+    return {
+        "sent": summary.sent,
+        "received": summary.received,
+        "loss": summary.loss,
+        "late": summary.late,
+        "unknown_packets": summary.unknown,
+        "crc_errors": statistics.crc_errors,
+        "lost_edges": statistics.lost_edges,
+        "packets_per_s": summary.packets_per_s,
+        "here": summary.local and summary.local._asdict(),
+        "there": summary.remote and summary.remote._asdict(),
+        "round_trip_ms": _times(summary.round_trip_ns),
+        "turnaround_ms": _times(summary.turnaround_ns),
+    }
+
+
+def _print_summary(summary: Summary, statistics: RadioStatistics) -> None:
+    loss = "" if summary.loss is None else f", {summary.loss:.1%} lost"
+    rate = "" if summary.packets_per_s is None else f", {summary.packets_per_s:.2f} packets/s both ways"
+    click.echo(f"received     {summary.received} replies{loss}{rate}")
+    click.echo(
+        f"rejected     {summary.late} late replies, {summary.unknown} unknown packets, "
+        f"{statistics.crc_errors} with a wrong CRC, {statistics.lost_edges} edges lost"
+    )
+    click.echo(f"replies      {_strength_text(summary.local)}")
+    click.echo(f"requests     {_strength_text(summary.remote)}, at the other side")
+    click.echo(f"round trip   {_times_text(summary.round_trip_ns)}, TxDone to RxDone")
+    click.echo(f"turnaround   {_times_text(summary.turnaround_ns)}, RxDone to start of the reply, there")
 
 
 def _legal_power_dbm(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int | None) -> int:

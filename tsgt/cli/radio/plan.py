@@ -145,22 +145,7 @@ def plan_command(
         raise click.UsageError(
             f"--stations {stations}: {protocol} supports at most {MAX_STATION_NUMBERS[protocol]}"
         )
-    if region is not None and frequency_mhz is None:
-        channel = CHANNELS[region]
-        frequency_mhz = channel.frequency_hz / 1e6
-        if _is_default("bandwidth_khz"):
-            modem = replace(modem, bandwidth_hz=channel.bandwidth_hz)
-    frequency_hz = round(1e6 * (frequency_mhz or _PAPER_MHZ))
-    if power_dbm is None:
-        power_dbm = MIN_POWER_DBM
-        if region is not None:
-            power_dbm = preset_power_dbm(
-                region,
-                frequency_hz=frequency_hz,
-                bandwidth_hz=modem.bandwidth_hz,
-                antenna_gain_dbi=antenna_gain_dbi,
-            )
-    settings = LoRaSettings(frequency_hz=frequency_hz, power_dbm=power_dbm, **asdict(modem))
+    settings = _settings(modem, region, frequency_mhz, power_dbm, antenna_gain_dbi)
     spoken: MasterProtocol = _CLASSIC
     if protocol == "superframe":
         spoken = _SUPERFRAME.model_copy(
@@ -171,7 +156,9 @@ def plan_command(
             }
         )
     received_dbm = (
-        power_dbm + 2 * antenna_gain_dbi - path_loss_db(distance_m, frequency_hz, path_loss_exponent)
+        settings.power_dbm
+        + 2 * antenna_gain_dbi
+        - path_loss_db(distance_m, settings.frequency_hz, path_loss_exponent)
     )
 
     def row(settings: LoRaSettings, stations: int) -> _Row:
@@ -202,9 +189,9 @@ def plan_command(
             {
                 "protocol": protocol,
                 "stations": stations,
-                "frequency_mhz": frequency_hz / 1e6,
+                "frequency_mhz": settings.frequency_hz / 1e6,
                 "bandwidth_khz": settings.bandwidth_hz / 1e3,
-                "power_dbm": power_dbm,
+                "power_dbm": settings.power_dbm,
                 "antenna_gain_dbi": antenna_gain_dbi,
                 "eirp_dbm": use.eirp_dbm,
                 "erp_dbm": use.erp_dbm,
@@ -231,6 +218,32 @@ def plan_command(
         )
         _print_table(table, numbers)
     return code
+
+
+def _settings(
+    modem: Modem,
+    region: str | None,
+    frequency_mhz: float | None,
+    power_dbm: int | None,
+    antenna_gain_dbi: float,
+) -> LoRaSettings:
+    """Return the settings; frequency, bandwidth and power that are not given are those of the region."""
+    if region is not None and frequency_mhz is None:
+        channel = CHANNELS[region]
+        frequency_mhz = channel.frequency_hz / 1e6
+        if _is_default("bandwidth_khz"):
+            modem = replace(modem, bandwidth_hz=channel.bandwidth_hz)
+    frequency_hz = round(1e6 * (frequency_mhz or _PAPER_MHZ))
+    if power_dbm is None:
+        power_dbm = MIN_POWER_DBM
+        if region is not None:
+            power_dbm = preset_power_dbm(
+                region,
+                frequency_hz=frequency_hz,
+                bandwidth_hz=modem.bandwidth_hz,
+                antenna_gain_dbi=antenna_gain_dbi,
+            )
+    return LoRaSettings(frequency_hz=frequency_hz, power_dbm=power_dbm, **asdict(modem))
 
 
 def _is_default(name: str) -> bool:

@@ -158,7 +158,7 @@ def _shown(wiring: WiringConfig) -> str:
     select = "by the kernel" if wiring.nss_pin < 0 else f"BCM {wiring.nss_pin}"
     return (
         f"spidev{wiring.spi_bus}.{wiring.spi_device}, chip select {select}, DIO0 BCM {wiring.dio0_pin}, "
-        f"back end {wiring.backend}"
+        f"backend {wiring.backend}"
     )
 
 

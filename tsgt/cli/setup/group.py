@@ -101,7 +101,7 @@ def _common(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--replace-key", is_flag=True, help="Replace the key of another mission."),
         _root_option,
         click.option(
-            "--yes", is_flag=True, help="Ask nothing: take the options, and the default of all others."
+            "--yes", is_flag=True, help="Do not ask; options that are not given take their defaults."
         ),
         click.option("--dry-run", is_flag=True, help="Print what would be changed, and change nothing."),
         json_option,

@@ -14,12 +14,12 @@ from tsgt.cli.setup.session import SetupStopped
 from tsgt.config import MasterConfig
 from tsgt.errors import ConfigError
 from tsgt.radio.planning import CHANNELS, REGIONS
+from tsgt.radio.superframe.wire import KEY_BYTES
 from tsgt.setup import MASTER, MasterAnswers, Mission, master_text
 
 if TYPE_CHECKING:
     from tsgt.cli.setup.options import Common
 
-KEY_BYTES = 32
 SPREADING_FACTOR = 9
 DEFAULT_STATIONS = 3
 

@@ -24,6 +24,7 @@ from tsgt.config import ClientConfig, InstrumentPort, TcpAddress
 from tsgt.errors import ConfigError
 from tsgt.setup import (
     CLIENT,
+    DEFAULT_BAUD,
     NO_INSTRUMENT,
     MissionError,
     Ports,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from tsgt.cli.setup.session import Session
     from tsgt.setup import FoundInstrument, Mission
 
-DEFAULT_BAUD = 115_200
 DEFAULT_PRISM_TYPE = "mini_360"
 PRISM_TYPES = ("round", "mini", "tape", "360", "mini_360", "mini_zero", "grz121", "mpr122")
 """Reflectors whose constant the instrument knows; any other needs its constant in the configuration."""
@@ -130,7 +130,7 @@ def _mission(session: Session, given: str | None, config: ClientConfig | None) -
         shared = given_mission(session, given, known)
     except MissionError as error:
         session.fail("mission", str(error))
-    session.report("mission", ok=True, detail=f"{channel_text(shared)}; check sum right")
+    session.report("mission", ok=True, detail=f"{channel_text(shared)}; checksum correct")
     return shared
 
 

@@ -53,6 +53,8 @@ from tsgt.simulation.runner import simulate
 from tsgt.simulation.scenario_files import MAX_STATIONS, find_scenario, with_stations
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from tsgt.config import ImuModelName
     from tsgt.simulation.mission import MissionResult
 
@@ -179,48 +181,19 @@ def simulate_command(
     """
     for path in (output, truth):
         require_new_file(path)
-    if protocol != "classic" and given["station_software"] == "authors":
-        raise click.UsageError("the authors' node speaks classic only; add --protocol classic")
-    if protocol != "classic" and clock_filter is not None:
-        raise click.UsageError("--clock-filter is for the protocol classic; add --protocol classic")
-    if protocol == "classic" and unauthenticated:
-        raise click.UsageError("--unauthenticated is for the protocol superframe; classic never has a key")
-    scenario = find_scenario(scenario_name)
-    if stations is not None:
-        scenario = with_stations(scenario, stations)
-    if model is not None:
-        scenario = scenario.model_copy(update={"imu": scenario.imu.model_copy(update={"model": model})})
-    if odometry:
-        if scenario.imu.model == "none":
-            raise click.UsageError(
-                "--odometry is used with an IMU, and the robot has none; add --imu industrial"
-            )
-        scenario = scenario.model_copy(update={"odometry": True})
-    if estimator is not None:
-        pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
-        scenario = scenario.model_copy(update={"pipeline": pipeline})
-    if point is not None:
-        known = scenario_parameters(scenario, imu=True)
-        config = ReferencePointConfig(**dataclasses.asdict(resolved_point(point, known)))
-        scenario = scenario.model_copy(update={"reference_point": config})
+    _check_protocol(protocol, clock_filter, given["station_software"], unauthenticated=unauthenticated)
+    scenario = _edited(
+        find_scenario(scenario_name),
+        stations=stations,
+        model=model,
+        odometry=odometry,
+        estimator=estimator,
+        point=point,
+        loss_probability=loss_probability,
+    )
     station_numbers = tuple(station.station for station in scenario.stations)
-    for number in station_numbers:
-        if number > MAX_STATION_NUMBERS[protocol]:
-            raise click.UsageError(
-                f"station {number}: {protocol} has station numbers 1 to {MAX_STATION_NUMBERS[protocol]}"
-            )
-    if loss_probability is not None:
-        radio = scenario.radio.model_copy(update={"loss_probability": loss_probability})
-        scenario = scenario.model_copy(update={"radio": radio})
-    faults = parse_faults(faults_text)
-    if faults and faults <= IMU_FAULTS and scenario.imu.model == "none":
-        raise click.UsageError(
-            "--faults: these are faults of the IMU, and the robot has none; add --imu industrial"
-        )
-    if faults and faults <= ODOMETRY_FAULTS and not scenario.odometry:
-        raise click.UsageError(
-            "--faults: these are faults of the wheel odometry, and the robot has none; add --imu industrial --odometry"
-        )
+    _check_station_numbers(station_numbers, protocol)
+    faults = _parsed_faults(faults_text, scenario)
     options = SimulationOptions(
         duration_s=scenario.duration_s if duration_s is None else duration_s,
         protocol=_protocol(protocol, clock_filter, fast_sync=bool(faults)),
@@ -264,6 +237,78 @@ def simulate_command(
     else:
         _print(result, found)
     return CHECK_FAILED if found else 0
+
+
+def _check_protocol(
+    protocol: str,
+    clock_filter: str | None,
+    station_software: str,
+    *,
+    unauthenticated: bool,
+) -> None:
+    """Reject options of the other protocol."""
+    if protocol != "classic" and station_software == "authors":
+        raise click.UsageError("the authors' node speaks classic only; add --protocol classic")
+    if protocol != "classic" and clock_filter is not None:
+        raise click.UsageError("--clock-filter is for the protocol classic; add --protocol classic")
+    if protocol == "classic" and unauthenticated:
+        raise click.UsageError("--unauthenticated is for the protocol superframe; classic never has a key")
+
+
+def _edited(
+    scenario: ScenarioConfig,
+    *,
+    stations: int | None,
+    model: ImuModelName | None,
+    odometry: bool,
+    estimator: str | None,
+    point: ReferencePoint | str | None,
+    loss_probability: float | None,
+) -> ScenarioConfig:
+    """Return a scenario with what the options change in it."""
+    if stations is not None:
+        scenario = with_stations(scenario, stations)
+    if model is not None:
+        scenario = scenario.model_copy(update={"imu": scenario.imu.model_copy(update={"model": model})})
+    if odometry:
+        if scenario.imu.model == "none":
+            raise click.UsageError(
+                "--odometry is used with an IMU, and the robot has none; add --imu industrial"
+            )
+        scenario = scenario.model_copy(update={"odometry": True})
+    if estimator is not None:
+        pipeline = scenario.pipeline.model_copy(update={"estimator": estimator})
+        scenario = scenario.model_copy(update={"pipeline": pipeline})
+    if point is not None:
+        known = scenario_parameters(scenario, imu=True)
+        config = ReferencePointConfig(**dataclasses.asdict(resolved_point(point, known)))
+        scenario = scenario.model_copy(update={"reference_point": config})
+    if loss_probability is not None:
+        radio = scenario.radio.model_copy(update={"loss_probability": loss_probability})
+        scenario = scenario.model_copy(update={"radio": radio})
+    return scenario
+
+
+def _check_station_numbers(station_numbers: Sequence[int], protocol: str) -> None:
+    for number in station_numbers:
+        if number > MAX_STATION_NUMBERS[protocol]:
+            raise click.UsageError(
+                f"station {number}: {protocol} has station numbers 1 to {MAX_STATION_NUMBERS[protocol]}"
+            )
+
+
+def _parsed_faults(text: str, scenario: ScenarioConfig) -> frozenset[FaultKind]:
+    """Return the kinds of faults; rejects those that the scenario cannot have."""
+    faults = parse_faults(text)
+    if faults and faults <= IMU_FAULTS and scenario.imu.model == "none":
+        raise click.UsageError(
+            "--faults: these are faults of the IMU, and the robot has none; add --imu industrial"
+        )
+    if faults and faults <= ODOMETRY_FAULTS and not scenario.odometry:
+        raise click.UsageError(
+            "--faults: these are faults of the wheel odometry, and the robot has none; add --imu industrial --odometry"
+        )
+    return faults
 
 
 def _protocol(
@@ -331,7 +376,10 @@ def _simulate(scenario: ScenarioConfig, options: SimulationOptions, folder: Path
 def _write_recording(run: MissionResult, output: Path) -> None:
     path = run.master_logs[-1].recording()
     if path is None:
-        raise OutputFileError("the master made no recording", path=output)
+        raise OutputFileError(
+            "the master wrote no recording: it ended before the first line; use a longer --duration, or see --faults",
+            path=output,
+        )
     with path.open("rb") as source, write_atomically(output) as target:
         shutil.copyfileobj(source, target)
 

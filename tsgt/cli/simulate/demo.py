@@ -70,7 +70,7 @@ class Result:
     "model",
     "--imu",
     default=None,
-    help="Class of the robot's IMU, with which live poses rest on it.  [default: that of the scenario]",
+    help="Class of the robot's IMU; with one, live poses use it.  [default: that of the scenario]",
 )
 @click.option("--scenario", "scenario_path", type=path_type, help="Scenario (TOML).  [default: dynamic]")
 @json_option

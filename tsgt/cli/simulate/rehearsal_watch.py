@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, NoReturn
 import numpy as np
 
 from tsgt.geometry import rotation_from_quaternion, transform_from
-from tsgt.recording import EventRecord, PoseRecord, SetupRecord, StatusRecord, decode
+from tsgt.recording import MAX_LINE_BYTES, EventRecord, PoseRecord, StatusRecord, decode
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 MAX_AGE_S = 4.0
 """Of a measurement; a busy computer delays some by a second or two."""
 
-_MAX_LINE_BYTES = 1 << 20
 _RECONNECT_DELAY_S = 0.2
 
 
@@ -53,7 +52,6 @@ class Watch:
     timeline: UnixTimeline
     socket: Path
     status: StatusRecord | None = None
-    setup: SetupRecord | None = None
     events: list[EventRecord] = field(default_factory=list)
     smoothed: list[PoseRecord] = field(default_factory=list)
     """Final smoothed poses that are valid."""
@@ -65,7 +63,7 @@ class Watch:
         """Read until cancelled."""
         while True:
             with suppress(OSError):
-                reader, writer = await asyncio.open_unix_connection(self.socket, limit=_MAX_LINE_BYTES)
+                reader, writer = await asyncio.open_unix_connection(self.socket, limit=MAX_LINE_BYTES)
                 self.connected = True
                 try:
                     while line := await reader.readline():
@@ -84,8 +82,6 @@ class Watch:
                 self.valid_s.append(self.site.now_s())
         elif line.startswith(b'{"type":"status"'):
             self.status = decode(StatusRecord, line)
-        elif line.startswith(b'{"type":"setup"'):
-            self.setup = decode(SetupRecord, line)
         elif line.startswith(b'{"type":"event"'):
             self.events.append(decode(EventRecord, line))
 

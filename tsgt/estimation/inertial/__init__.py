@@ -6,11 +6,8 @@ contradicted while the robot drives (`setup_monitor`), and the trajectory with o
 
 from tsgt.estimation.inertial.samples import SampleConverter, inertial_samples
 from tsgt.estimation.inertial.selection import (
-    ImuSelector,
     ImuState,
     OdometryState,
-    QueriedTrajectory,
-    TrajectoryWindow,
 )
 from tsgt.estimation.inertial.setup_monitor import (
     ImuSetupMonitor,
@@ -21,14 +18,11 @@ from tsgt.estimation.inertial.setup_monitor import (
 from tsgt.estimation.inertial.wheels import wheel_samples
 
 __all__ = [
-    "ImuSelector",
     "ImuSetupMonitor",
     "ImuState",
     "OdometryState",
-    "QueriedTrajectory",
     "SampleConverter",
     "StartCheck",
-    "TrajectoryWindow",
     "check_recorded_setup",
     "inertial_samples",
     "start_now",

@@ -9,7 +9,7 @@ IMU falls silent, disagrees or turns out to be set up wrongly, the next poses ar
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,17 +17,16 @@ from tsgt.estimation.inertial.samples import SampleConverter
 from tsgt.estimation.inertial.wheels import WheelConverter
 from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial import DISAGREES_WITH_PRISMS
+from tsgt.geometry.trajectory import POSE_DIM
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
     from tsgt.estimation.inertial.setup_monitor import ImuSetupMonitor
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.inertial import InertialSamples, WheelSamples, WheelsEstimate
-    from tsgt.geometry.trajectory import Observations, States
+    from tsgt.geometry.inertial import InertialFixedLagSmoother, WheelsEstimate
+    from tsgt.geometry.trajectory import MeasurementWindow, Observations, States
     from tsgt.model import ImuParameters, ImuSamples, OdometryParameters, OdometrySamples, Vector3
     from tsgt.recording.stream_records import OdometryUse
 
@@ -63,7 +62,6 @@ UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 0.35 deg rms, a lever arm 100 mm off or a latency 10 ms off by 2 mm and 0.2 deg (benchmarks/run.py imu_trust).
 """
 
-_POSE_DIM = 6
 _SIMULTANEOUS_S = 0.01  # Measurements of one prism are further apart
 
 MAX_NIS, MAX_LASTING_NIS = 60.0, 30.0
@@ -75,136 +73,6 @@ COMPARISON_INTERVAL_S = 0.5
 COMPARED_AGE_S = 1.0  # Of smoothed poses that are compared
 
 _KEPT_BEFORE_START_NS = 5_000_000_000  # of samples, before the first measurement
-
-
-class QueriedTrajectory(Protocol):
-    """A trajectory with its uncertainty, over the times of a window."""
-
-    @property
-    def unchanged_until_s(self) -> float:
-        """Time up to which states stay the same, whatever arrives."""
-        ...
-
-    def at(self, time_s: FloatArray, *, dim: int = ...) -> tuple[States, FloatArray]:
-        """Return states at N times, and the (N, dim, dim) covariance of their leading error components."""
-        ...
-
-    def common_at(self, time_s: FloatArray, *, dim: int = ...) -> FloatArray | None:
-        """Return the (N, dim, dim) covariance that the set-up's uncertainty adds; None: unknown."""
-        ...
-
-
-class TrajectoryWindow(Protocol):
-    """What poses need of a fixed-lag smoother; see :class:`~tsgt.geometry.trajectory.FixedLagSmoother`."""
-
-    @property
-    def residuals_m(self) -> FloatArray:
-        """(M, 3) of the measurements in the window, in the order of time."""
-        ...
-
-    @property
-    def horizon_s(self) -> float:
-        """Start of the window."""
-        ...
-
-    @property
-    def initialised(self) -> bool:
-        """Whether there is a trajectory."""
-        ...
-
-    @property
-    def converged(self) -> bool:
-        """Whether it is certain enough and explains the measurements."""
-        ...
-
-    @property
-    def reliable_from_s(self) -> float:
-        """Time from which it is reliable."""
-        ...
-
-    @property
-    def ambiguous(self) -> bool:
-        """Whether the newest measurements are inconsistent."""
-        ...
-
-    @property
-    def ambiguous_from_s(self) -> float:
-        """Start of the current ambiguity."""
-        ...
-
-    def ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether the state stays ambiguous at times, (N,)."""
-        ...
-
-    def recently_ambiguous_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
-        """Whether the state was ambiguous shortly before times, (N,)."""
-        ...
-
-    def update(self, new: Observations) -> None:
-        """Process measurements, in the order of time."""
-        ...
-
-    def marginalise_before(self, before_s: float) -> None:
-        """Marginalise the states before a time."""
-        ...
-
-    def predict(self, time_s: float, *, dim: int = ...) -> tuple[States, FloatArray]:
-        """Return the state at a time, given all measurements so far, with its covariance."""
-        ...
-
-    def common_at(self, time_s: float, *, dim: int = ...) -> FloatArray | None:
-        """Return the (1, dim, dim) covariance that the set-up's uncertainty adds to it; None: unknown."""
-        ...
-
-    def trajectory(self) -> QueriedTrajectory:
-        """Return the trajectory over the window."""
-        ...
-
-    def smoothed_trajectory(self) -> QueriedTrajectory:
-        """Return the same for poses between measurements, with rest."""
-        ...
-
-
-class InertialWindow(TrajectoryWindow, Protocol):
-    """The same with an IMU."""
-
-    @property
-    def health(self) -> str | None:
-        """Why the samples of the IMU are rejected now, for people; None: they are used."""
-        ...
-
-    @property
-    def setup_uncertain(self) -> bool:
-        """Whether its mounting may have changed."""
-        ...
-
-    @property
-    def followed_for_s(self) -> float:
-        """Time over which the trajectory has followed inconsistent measurements, once they are consistent again."""
-        ...
-
-    @property
-    def shock(self) -> bool:
-        """Whether a shock may have displaced the IMU."""
-        ...
-
-    @property
-    def biases(self) -> tuple[FloatArray, FloatArray | None] | None:
-        """Newest biases of gyro and accelerometer, (3,) each; None where unknown."""
-        ...
-
-    @property
-    def wheels(self) -> WheelsEstimate | None:
-        """Newest errors of the wheel odometry; None where unknown."""
-        ...
-
-    def add_samples(self, samples: InertialSamples) -> None:
-        """Take samples that follow the earlier ones."""
-        ...
-
-    def add_odometry(self, new: WheelSamples) -> None:
-        """Take samples of the wheel odometry that follow the earlier ones."""
-        ...
 
 
 class OdometryState(NamedTuple):
@@ -239,8 +107,8 @@ class ImuSelector:
     def __init__(
         self,
         imu: ImuParameters,
-        without: TrajectoryWindow,
-        create_with: Callable[[], InertialWindow],
+        without: MeasurementWindow,
+        create_with: Callable[[], InertialFixedLagSmoother],
         setup: ImuSetupMonitor | None = None,
         *,
         prisms: int = MIN_PRISMS,
@@ -270,7 +138,7 @@ class ImuSelector:
         self._disagreement = ""
 
     @property
-    def window(self) -> TrajectoryWindow:
+    def window(self) -> MeasurementWindow:
         """The window whose trajectory is used."""
         return self._with if self.use == ImuUse.USED else self._without
 
@@ -466,12 +334,12 @@ class ImuSelector:
         if not self._with.converged or not self._without.converged or self._without.ambiguous:
             return
         predicted = _nis(
-            *self._with.predict(now_s, dim=_POSE_DIM), *self._without.predict(now_s, dim=_POSE_DIM)
+            *self._with.predict(now_s, dim=POSE_DIM), *self._without.predict(now_s, dim=POSE_DIM)
         )
         then_s = np.array([now_s - COMPARED_AGE_S])
         smoothed = 0.0
         if then_s[0] > max(each.reliable_from_s for each in (self._with, self._without)):
-            both = (each.trajectory().at(then_s, dim=_POSE_DIM) for each in (self._with, self._without))
+            both = (each.trajectory().at(then_s, dim=POSE_DIM) for each in (self._with, self._without))
             smoothed = _nis(*next(both), *next(both))
         found = (predicted, smoothed)
         lasting = (min(pair) for pair in zip(found, self._nis, strict=True))
@@ -487,7 +355,7 @@ class ImuSelector:
 
 def _nis(state: States, _: FloatArray, other: States, covariance: FloatArray) -> float:
     """Squared distance of a pose from another, in sigmas of the latter."""
-    error = state.local_coordinates_about(other)[0, :_POSE_DIM]
+    error = state.local_coordinates_about(other)[0, :POSE_DIM]
     return float(error @ np.linalg.solve(covariance[0], error))
 
 

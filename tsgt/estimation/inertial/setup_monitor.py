@@ -52,8 +52,6 @@ and ten times as long, while the master waited for its result; what comes of it 
 
 UNSAMPLED_S = 2.0  # By which measurements may precede the samples that they are compared with
 
-_POSE_DIM = 6
-
 _CONFIRMATION = "mounting, latency, axes and units of the IMU agree with the drive"
 _CONFIRMATION_BY_PRISMS = {
     1: "position and latency of the IMU agree with the drive; a single prism does not tell its rotation",
@@ -114,7 +112,7 @@ def check_recorded_setup(
         if few_prisms:
             with_imu = fit_inertial_trajectory(observations, samples, imu, reference_m=centroid_m(parameters))
             knots = with_imu.trajectory.knots
-            states, _ = with_imu.trajectory.at(knots.time_s, dim=_POSE_DIM)
+            states, _ = with_imu.trajectory.at(knots.time_s)
             bias = knots.gyro_bias.mean(axis=0)
             return check_few_prisms(
                 observations,

@@ -48,11 +48,9 @@ from tsgt.geometry.trajectory.motion_prior import (
     process_information,
     transition,
 )
-from tsgt.model import MotionPrior
+from tsgt.model import MIN_PRISMS, MotionPrior
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from tsgt.geometry.rigid import FloatArray
@@ -166,7 +164,6 @@ def tune(
     start: MotionPrior | None = None,
     noise_scale: FloatArray | float | None = None,
     noise_only: bool = False,
-    on_progress: Callable[[int], None] | None = None,
 ) -> Hyperparameters:
     """Find the maximum-evidence hyperparameters.
 
@@ -178,7 +175,6 @@ def tune(
     start : Initial prior; hardly affects the result.
     noise_scale : Kept at this value, or these of (S, 3); estimated as well when not given.
     noise_only : Keep the prior and estimate only the noise.
-    on_progress : Called with the number of evaluations.
     """
     scales = np.ones((len(observations.frames), 3)) * (1.0 if noise_scale is None else noise_scale)
     initial = log_parameters(MotionPrior() if start is None else start, scales)
@@ -189,7 +185,7 @@ def tune(
         lower[len(_LOWER) :] = upper[len(_LOWER) :] = initial[len(_LOWER) :]
     if noise_only:
         lower[: len(_LOWER)] = upper[: len(_LOWER)] = initial[: len(_LOWER)]
-    return maximise_evidence(observations, initial, lower, upper, on_progress=on_progress)
+    return maximise_evidence(observations, initial, lower, upper)
 
 
 def maximise_evidence(
@@ -197,13 +193,10 @@ def maximise_evidence(
     start: FloatArray,
     lower: FloatArray,
     upper: FloatArray,
-    *,
-    local: bool = True,
-    on_progress: Callable[[int], None] | None = None,
 ) -> Hyperparameters:
-    """Maximise the evidence; bounds and start: parameters of :func:`log_parameters`; as :func:`tune`.
+    """Maximise the evidence; bounds and start: (P,) each, in the order of :func:`log_parameters`; as :func:`tune`.
 
-    With ``local`` the process noise varies along the drive, and the evidence is that with its estimate.
+    The process noise varies along the drive, and the evidence is that with its estimate.
     """
     segments = _segments(observations)
     least = np.full_like(lower, -np.inf)
@@ -211,13 +204,8 @@ def maximise_evidence(
     least[_SCALE_PARAMETERS] = np.log(min_scales(observations, rest)).ravel()
     lower = np.where(lower < upper, np.clip(least, lower, upper), lower)
     start = np.clip(start, lower, upper)
-    evaluations = 0
 
     def evidence(parameters: FloatArray) -> Curved:
-        nonlocal evaluations
-        evaluations += 1
-        if on_progress is not None:
-            on_progress(evaluations)
         total = _log_hyperprior(parameters)
         for segment in segments:
             part = _evidence(segment, parameters)
@@ -229,14 +217,13 @@ def maximise_evidence(
         return total
 
     found, value = maximise(evidence, start, lower, upper)
-    if local:
-        try:
-            for segment in segments:
-                segment.adapt(found)
-            found, value = maximise(evidence, found, lower, upper)
-        except GeometryError:
-            # Next to no process noise in a calm second, at the lower limit: singular to rounding. The first result holds.
-            pass
+    try:
+        for segment in segments:
+            segment.adapt(found)
+        found, value = maximise(evidence, found, lower, upper)
+    except GeometryError:
+        # Next to no process noise in a calm second, at the lower limit: singular to rounding. The first result holds.
+        pass
     prior, scales = _from_log_parameters(found)
     return Hyperparameters(prior, scales, overall_scale(observations, scales), value)
 
@@ -395,7 +382,6 @@ def _expected_log_density(
 
 NOISE_FLOOR_SHARE = 1.0 / 3.0  # Of the configured prior's process noise
 OUTAGE_S = 2.0  # Longest gap between measurements of a prism that counts as observed
-_MIN_PRISMS = 3
 
 _MANOEUVRE_RADPS = 1.0  # Accelerating and braking, or turning there and back: six seconds
 
@@ -431,4 +417,4 @@ def partially_occluded(time_s: FloatArray, prism: NDArray[np.intp], at_s: FloatA
         own_s = np.concatenate([[-np.inf], time_s[prism == each], [np.inf]])
         after = np.searchsorted(own_s, at_s)
         observed += own_s[after] - own_s[after - 1] <= OUTAGE_S
-    return observed < _MIN_PRISMS
+    return observed < MIN_PRISMS

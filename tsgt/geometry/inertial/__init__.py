@@ -5,50 +5,40 @@ docs/explanation/imu.md derives the equations.
 """
 
 from tsgt.geometry.inertial.anchor import InertialAnchor
-from tsgt.geometry.inertial.factors import InertialFactors
-from tsgt.geometry.inertial.initialisation import HeadingSearch, search_heading, states_on_tracks
+from tsgt.geometry.inertial.initialisation import search_heading, states_on_tracks
 from tsgt.geometry.inertial.live import (
     DISAGREES_WITH_PRISMS,
     InertialFixedLagSmoother,
     SaturationMonitor,
-    WindowTrajectory,
     usable_samples,
 )
-from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
+from tsgt.geometry.inertial.odometry import WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.preintegration import ContiguousSamples, Preintegrated, contiguous, preintegrate
-from tsgt.geometry.inertial.query import InertialTrajectory, strapdown
+from tsgt.geometry.inertial.query import InertialTrajectory
 from tsgt.geometry.inertial.samples import InertialSamples, concatenate_samples
 from tsgt.geometry.inertial.smoother import (
     InertialFit,
     WheelsFit,
     estimation_noise,
-    find_start,
     fit_inertial_trajectory,
 )
 from tsgt.geometry.inertial.solver import (
-    MAX_KNOT_SPACING_S,
     InertialSetup,
     InertialSolution,
     inertial_knot_times,
     solve_inertial,
 )
 from tsgt.geometry.inertial.states import (
-    INERTIAL_STATE_DIM,
     Gravity,
     InertialStates,
     Mounting,
-    concatenate_inertial_states,
 )
 
 __all__ = [
     "DISAGREES_WITH_PRISMS",
-    "INERTIAL_STATE_DIM",
-    "MAX_KNOT_SPACING_S",
     "ContiguousSamples",
     "Gravity",
-    "HeadingSearch",
     "InertialAnchor",
-    "InertialFactors",
     "InertialFit",
     "InertialFixedLagSmoother",
     "InertialSamples",
@@ -57,24 +47,19 @@ __all__ = [
     "InertialStates",
     "InertialTrajectory",
     "Mounting",
-    "Odometry",
     "Preintegrated",
     "SaturationMonitor",
     "WheelSamples",
     "WheelsEstimate",
     "WheelsFit",
-    "WindowTrajectory",
-    "concatenate_inertial_states",
     "concatenate_samples",
     "contiguous",
     "estimation_noise",
-    "find_start",
     "fit_inertial_trajectory",
     "inertial_knot_times",
     "preintegrate",
     "search_heading",
     "solve_inertial",
     "states_on_tracks",
-    "strapdown",
     "usable_samples",
 ]

@@ -7,7 +7,7 @@ an accelerometer the motion prior interpolates positions, and the gyro rotations
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from tsgt.geometry.rigid import (
     matvec,
     skew,
 )
-from tsgt.geometry.trajectory import States, concatenate_states
+from tsgt.geometry.trajectory import POSE_DIM, States, concatenate_states
 from tsgt.geometry.trajectory.motion_prior import interpolation_weights
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from tsgt.model import MotionPrior
 
 _CHUNK = 512  # Times per pass; stays in the cache
-_POSE_DIM = 6
 
 
 class Predicted(NamedTuple):
@@ -101,7 +100,7 @@ class InertialTrajectory:
     # (7, r) errors of the mounting in the same columns (sensitivity.MOUNTING_DIM); None: it is exact
     mounting_factor: FloatArray | None = None
 
-    def at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> tuple[States, FloatArray]:
+    def at(self, time_s: FloatArray, *, dim: int = POSE_DIM) -> tuple[States, FloatArray]:
         """Return states of the reference point and of the robot's axes at N times, and the (N, 6, 6) covariance of their poses.
 
         ``dim``: 6. Angular accelerations are zero: no sample tells them. Raises GeometryError: a time is outside the knots.
@@ -109,7 +108,7 @@ class InertialTrajectory:
         states, covariance, _ = self._in_chunks(time_s, common=False)
         return states, covariance[:, :dim, :dim]
 
-    def common_at(self, time_s: FloatArray, *, dim: int = _POSE_DIM) -> FloatArray | None:
+    def common_at(self, time_s: FloatArray, *, dim: int = POSE_DIM) -> FloatArray | None:
         """Return the (N, 6, 6) covariance of poses at N times that the set-up's uncertainty adds; None: unknown."""
         if self.displacement is None:
             return None
@@ -246,14 +245,14 @@ class InertialTrajectory:
         # Isotropic noise, in the axes at this time.
         correction = share * matvec(onward.swapaxes(1, 2), error)
         rotation = earlier.rotation @ part.rotation @ exp_so3(correction)
-        by_earlier, by_later = np.zeros((2, len(time_s), _POSE_DIM, INERTIAL_STATE_DIM))
+        by_earlier, by_later = np.zeros((2, len(time_s), POSE_DIM, INERTIAL_STATE_DIM))
         weight = share[..., None]
         by_earlier[:, 3:6, 3:6] = (1.0 - weight) * part.rotation.swapaxes(1, 2)
         by_later[:, 3:6, 3:6] = weight * onward.swapaxes(1, 2)
         by_earlier[:, 3:6, 9:12] = part.by_gyro_bias[:, 3:6] - weight * (
             onward.swapaxes(1, 2) @ step.by_gyro_bias[:, 3:6]
         )
-        noise = np.zeros((len(time_s), _POSE_DIM, _POSE_DIM))
+        noise = np.zeros((len(time_s), POSE_DIM, POSE_DIM))
         noise[:, 3:6, 3:6] = ((1.0 - share) * part.covariance[:, 3, 3, None])[..., None] * IDENTITY
         from_earlier, from_later, conditional = interpolation_weights(
             time_s - earlier.time_s,
@@ -275,7 +274,7 @@ class InertialTrajectory:
 
     def _to_reference(self, rotation: FloatArray) -> FloatArray:
         """(N, 6, 6) Jacobian of the errors of the reference point and the robot's axes by those of the IMU's pose."""
-        by_error = np.zeros((len(rotation), _POSE_DIM, _POSE_DIM))
+        by_error = np.zeros((len(rotation), POSE_DIM, POSE_DIM))
         by_error[:, 0:3, 0:3] = IDENTITY
         by_error[:, 0:3, 3:6] = -rotation @ skew(self.mounting.in_imu(np.zeros(3)))
         by_error[:, 3:6, 3:6] = self.mounting.rotation
@@ -301,7 +300,3 @@ class InertialTrajectory:
             acceleration + matvec(rotation, cross(rate, turning)),
             np.zeros_like(position),
         )
-
-    def from_point(self, point: FloatArray) -> InertialTrajectory:
-        """Return the trajectory for another reference point of the robot, (3,) from the present one, in the robot's axes."""
-        return replace(self, mounting=replace(self.mounting, position=self.mounting.position - point))

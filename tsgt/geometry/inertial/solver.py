@@ -98,16 +98,9 @@ class InertialSolution(NamedTuple):
     factors: InertialFactors
 
 
-def inertial_knot_times(
-    time_s: FloatArray, *, start_s: float | None = None, end_s: float | None = None
-) -> FloatArray:
-    """Choose knot times for measurements at times ``time_s``, at least one; from ``start_s`` to ``end_s`` when given."""
+def inertial_knot_times(time_s: FloatArray) -> FloatArray:
+    """Choose knot times for measurements at times ``time_s``, at least one."""
     times_s = knot_times(time_s)
-    ends = (
-        ([] if start_s is None or start_s >= times_s[0] else [start_s]),
-        ([] if end_s is None or end_s <= times_s[-1] else [end_s]),
-    )
-    times_s = np.concatenate([ends[0], times_s, ends[1]])
     steps = np.ceil(np.diff(times_s) / MAX_KNOT_SPACING_S - 1e-9).astype(np.int64)
     parts = [
         times_s[i] + (times_s[i + 1] - times_s[i]) * np.arange(1, steps[i]) / steps[i]
@@ -215,7 +208,7 @@ class _Search:
         iterations = 0
         factors = self._integrated_again(knots, factors)
         system = self._evaluate(knots, gravity, factors)
-        factor = _factorise(system)
+        factor = factorise(system)
         far = shortened = False
         while iterations < max_iterations:
             iterations += 1
@@ -225,7 +218,7 @@ class _Search:
                 if far and (integrated := self._integrated_again(knots, factors)) is not factors:
                     factors, far = integrated, False
                     system = self._evaluate(knots, gravity, factors)
-                    factor = _factorise(system)
+                    factor = factorise(system)
                     continue
                 knots, gravity = knots.retract(step), gravity.retract(shared)
                 system = apply_linear_step(system, self.knot_index, step, gain)
@@ -248,7 +241,7 @@ class _Search:
             if integrated is not factors:
                 factors, decrease = integrated, np.inf
                 system = self._evaluate(knots, gravity, factors)
-            factor = _factorise(system)
+            factor = factorise(system)
             if decrease < COST_TOLERANCE:
                 break
         found = system.squared_distances, system.weights, system.linearised, self.knot_index, system.cost
@@ -319,7 +312,8 @@ class _Search:
         return again
 
 
-def _factorise(system: InertialEquations) -> BorderedCholesky:
+def factorise(system: InertialEquations) -> BorderedCholesky:
+    """Factorise the normal equations. Raises GeometryError: they are not positive definite."""
     return factorise_bordered(system.diagonal, system.off_diagonal, system.border, system.corner)
 
 

@@ -4,14 +4,13 @@ In: polar measurements of the prisms, raw samples. Out: the set-up with its cova
 causes of a set-up that contradicts the data. docs/explanation/imu.md derives the equations.
 """
 
-from tsgt.geometry.inertial_calibration.alignment import Alignment, align, series_of_samples, series_of_states
 from tsgt.geometry.inertial_calibration.calibration import ImuCalibration, calibrate_imu
 from tsgt.geometry.inertial_calibration.observability import (
     SetupComponent,
     robot_covariance,
     setup_components,
 )
-from tsgt.geometry.inertial_calibration.setup import ImuSetup, SetupPrior, in_calibrated_axes
+from tsgt.geometry.inertial_calibration.setup import ImuSetup
 from tsgt.geometry.inertial_calibration.setup_check import (
     MIN_CHECKED_MEASUREMENTS,
     Cause,
@@ -23,21 +22,15 @@ from tsgt.geometry.inertial_calibration.setup_check import (
 
 __all__ = [
     "MIN_CHECKED_MEASUREMENTS",
-    "Alignment",
     "Cause",
     "ImuCalibration",
     "ImuSetup",
     "SetupCheck",
     "SetupComponent",
     "SetupFinding",
-    "SetupPrior",
-    "align",
     "calibrate_imu",
     "check_few_prisms",
     "check_imu_setup",
-    "in_calibrated_axes",
     "robot_covariance",
-    "series_of_samples",
-    "series_of_states",
     "setup_components",
 ]

@@ -31,7 +31,13 @@ from tsgt.geometry.inertial_calibration.joint_solver import (
     without_tilt,
 )
 from tsgt.geometry.inertial_calibration.joint_system import assemble_border, assemble_states, stamp_times
-from tsgt.geometry.inertial_calibration.setup import MOUNTING_DIM, ROTATION, ImuSetup, SetupPrior
+from tsgt.geometry.inertial_calibration.setup import (
+    GYRO_MATRIX,
+    POSE_AND_LATENCY_DIM,
+    ROTATION,
+    ImuSetup,
+    SetupPrior,
+)
 from tsgt.geometry.motion_calibration.timestamp_drift import SegmentInformation, birge_ratio
 from tsgt.geometry.trajectory.block_tridiagonal import factorise
 
@@ -155,7 +161,7 @@ def _judged(solution: JointSolution, alignment: Alignment, log_bayes_factor: flo
         own = np.linalg.inv(np.diag(sigmas**-2.0) + sum(each.information for each in half))
         difference -= sign * (own @ (deviation + sum(each.gradient for each in half)))
         uncertainty += own
-    of_setup = slice(TILT_DIM, TILT_DIM + MOUNTING_DIM)
+    of_setup = slice(TILT_DIM, TILT_DIM + POSE_AND_LATENCY_DIM)
     difference, uncertainty = difference[of_setup], uncertainty[of_setup, of_setup]
     covariance[ROTATION, ROTATION] += variation(difference[ROTATION], uncertainty[ROTATION, ROTATION])
     states = solution.equations.states
@@ -167,7 +173,7 @@ def _judged(solution: JointSolution, alignment: Alignment, log_bayes_factor: flo
         0.5 * (covariance + covariance.T),
         problem.prior,
         alignment,
-        float(problem.prior.sigmas[MOUNTING_DIM]),
+        float(problem.prior.sigmas[GYRO_MATRIX][0]),
         log_bayes_factor,
         ratio,
         difference,

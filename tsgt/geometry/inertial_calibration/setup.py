@@ -11,7 +11,7 @@ matrix and the delays are estimated for the sake of the others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 ROTATION, POSITION, LATENCY = slice(0, 3), slice(3, 6), 6
 GYRO_MATRIX, ACCELEROMETER_MATRIX, DELAYS = slice(7, 14), slice(14, 22), slice(22, None)
-MOUNTING_DIM = 7  # Rotation, position and latency
+POSE_AND_LATENCY_DIM = 7  # Rotation, position and latency
 
 ROTATION_SIGMA_RAD = 1.0
 POSITION_SIGMA_M = 1.0
@@ -35,20 +35,20 @@ DELAY_SIGMA_S = 5e-4
 
 def gyro_directions(vertical: FloatArray) -> FloatArray:
     """(7, 3, 3) orthonormal free components of the gyro matrix: a rate about the vertical stays one."""
-    frame = _frame(vertical)
+    frame = axes_about(vertical)
     products = frame[:, None, :, None] * frame[None, :, None, :]
     return np.stack([products[i, j] for i in range(3) for j in range(3) if (i, j) not in {(0, 2), (1, 2)}])
 
 
 def accelerometer_directions(vertical: FloatArray) -> FloatArray:
     """(8, 3, 3) orthonormal free components of the accelerometer's matrix: it does not turn about the vertical."""
-    frame = _frame(vertical)
+    frame = axes_about(vertical)
     products = frame[:, None, :, None] * frame[None, :, None, :]
     others = [products[i, j] for i in range(3) for j in range(3) if (i, j) not in {(0, 1), (1, 0)}]
     return np.stack([*others, (products[0, 1] + products[1, 0]) / np.sqrt(2.0)])
 
 
-def _frame(vertical: FloatArray) -> FloatArray:
+def axes_about(vertical: FloatArray) -> FloatArray:
     """(3, 3) right-handed orthonormal vectors, one per row; the last is the vertical."""
     first = np.cross(np.eye(3)[(int(np.argmax(np.abs(vertical))) + 1) % 3], vertical)
     first = first / np.linalg.norm(first)
@@ -113,7 +113,7 @@ def gyro_rotation(setup: ImuSetup) -> FloatArray:
     """(3, D) Jacobian of the rotation of the gyro's axes, the average of the three, by the error of a set-up."""
     jacobian = np.zeros((3, setup.dim))
     jacobian[:, ROTATION] = np.eye(3)
-    first, second, vertical = _frame(setup.vertical)
+    first, second, vertical = axes_about(setup.vertical)
     directions = gyro_directions(setup.vertical)
     jacobian[:, GYRO_MATRIX] = 0.5 * np.outer(
         vertical, second @ directions @ first - first @ directions @ second
@@ -141,24 +141,3 @@ class SetupPrior:
 def _components(directions: FloatArray, matrix: FloatArray) -> FloatArray:
     found: FloatArray = np.einsum("ijk,jk->i", directions, matrix)
     return found
-
-
-def in_calibrated_axes(setup: ImuSetup) -> ImuSetup:
-    """Return a set-up that takes samples to the same rates and forces of the robot, in the axes defined above."""
-    first, second, vertical = _frame(setup.vertical)
-    direction = setup.gyro_matrix @ vertical
-    direction = direction / np.linalg.norm(direction)
-    turn = exp_so3(np.cross(vertical, direction))
-    turn = turn @ exp_so3(np.cross(vertical, turn.T @ direction))
-    aligned = turn.T @ setup.accelerometer_matrix
-    angle = np.arctan2(
-        second @ aligned @ first - first @ aligned @ second,
-        first @ aligned @ first + second @ aligned @ second,
-    )
-    turn = turn @ exp_so3(angle * vertical)
-    return replace(
-        setup,
-        mounting=Mounting(setup.mounting.rotation @ turn, setup.mounting.position),
-        gyro_matrix=turn.T @ setup.gyro_matrix,
-        accelerometer_matrix=turn.T @ setup.accelerometer_matrix,
-    )

@@ -16,7 +16,7 @@ from tsgt.geometry.motion_calibration.cause_selection import (
 )
 from tsgt.geometry.motion_calibration.hypotheses import Hypothesis, HypothesisKind
 from tsgt.geometry.motion_calibration.initialisation import frames_from_motion
-from tsgt.geometry.motion_calibration.observability import UnobservableDirection, unobservable_directions
+from tsgt.geometry.motion_calibration.observability import unobservable_directions
 from tsgt.geometry.motion_calibration.refinement import HypothesisEvidence, RefinedSetup, refine_setup
 from tsgt.geometry.motion_calibration.setup_errors import LinearisedSetup, SetupErrors, linearise_setup
 from tsgt.geometry.motion_calibration.setup_parameters import INSTRUMENT_ERRORS, Setup, SetupParameters
@@ -39,7 +39,6 @@ __all__ = [
     "SetupErrors",
     "SetupParameters",
     "SetupPrior",
-    "UnobservableDirection",
     "calibrate_motion",
     "calibrated_covariance",
     "cause_hypotheses",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,16 +21,11 @@ PRISM_LIMIT_M = 0.005
 MIN_COMPONENT_SHARE = 0.2  # Of a direction's largest; smaller components are not described
 
 
-@dataclass(frozen=True, slots=True)
-class UnobservableDirection:
-    """A direction of the set-up that the motion left uncertain."""
+def unobservable_directions(calibration: MotionCalibration) -> list[str]:
+    """Directions whose uncertainty exceeds the limits, largest first: eigenvectors of the scaled covariance.
 
-    description: str  # All components of the direction, which change together, by one sigma each, in words
-    excess: float  # Ratio of its uncertainty to the limit
-
-
-def unobservable_directions(calibration: MotionCalibration) -> list[UnobservableDirection]:
-    """Directions whose uncertainty exceeds the limits, largest first: eigenvectors of the scaled covariance."""
+    In words: all components of a direction, which change together, by one sigma each.
+    """
     parameters = calibration.parameters
     limits = np.full(parameters.count, np.inf)
     limits[parameters.translations] = TRANSLATION_LIMIT_M
@@ -45,10 +39,9 @@ def unobservable_directions(calibration: MotionCalibration) -> list[Unobservable
     for value, free_vector in zip(values[::-1], vectors.T[::-1], strict=True):
         if value <= 1.0:
             break
-        excess = float(np.sqrt(value))
         vector, sigma = np.zeros((2, parameters.count))
-        vector[free], sigma[free] = free_vector, excess * scale * free_vector
-        directions.append(UnobservableDirection(_describe(calibration, vector, sigma), excess))
+        vector[free], sigma[free] = free_vector, np.sqrt(value) * scale * free_vector
+        directions.append(_describe(calibration, vector, sigma))
     return directions
 
 

@@ -57,11 +57,9 @@ class HypothesisEvidence:
 
     hypothesis: Hypothesis  # Its prior odds are not part of the Bayes factors
     log_bayes_factor: float  # Against the set-up as calibrated, if this alone is wrong
-    remaining_log_bayes_factor: float  # The same, given all that was selected before it, or at all
     selected: bool
     estimate: FloatArray  # (m,) if this alone is wrong
     sigma: FloatArray  # (m,)
-    segment_estimates: FloatArray  # (N, m) of each segment alone
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +77,6 @@ class RefinedSetup:
     evidence: tuple[HypothesisEvidence, ...]
     birge_ratio: float  # Factor by which segments disagree more than noise explains; in the covariance
     wander_s: float  # One sigma of each station's latency from segment to segment
-    segment_times_s: FloatArray  # (N,) centres of the segments
     motion_prior: (
         MotionPrior  # Tuned with the set-up that fits best if everything may be wrong, if that may differ
     )
@@ -120,7 +117,7 @@ def refine_setup(
     birge = birge_ratio(_at_optimum(information, wide)[0], wide)
     total = _total(information, birge)
     allowed = [each for each in tested if prisms or each.kind != "prism"]
-    selected, gains = _select(total, nominal, allowed)
+    selected = _select(total, nominal, allowed)
     factor = _widened(nominal, *selected)
     # Against a set-up that is exact: its evidence is the constant that the others leave out.
     gain = total.evidence(factor)
@@ -129,10 +126,8 @@ def refine_setup(
         HypothesisEvidence(
             each,
             total.evidence(_widened(nominal, each)) - total.evidence(nominal),
-            gains[each] if each in gains else total.evidence(_widened(factor, each)) - total.evidence(factor),
-            used and each in gains,
+            used and each in selected,
             *_estimate(total, nominal, each),
-            np.array([_estimate(_total([one], birge), nominal, each)[0] for one in information]),
         )
         for each in tested
     )
@@ -153,9 +148,8 @@ def refine_setup(
         displaced = refined @ final.matrix[:, considered] - np.eye(parameters.count)[:, considered]
         displaced = displaced @ factor[considered]
         posterior = refined + displaced @ displaced.T
-    times_s = np.array([float(np.mean(each.observations.time_s)) for each in segments])
     return RefinedSetup(
-        setup, parameters, posterior, used, gain, p_value, evidence, birge, wander_s, times_s, model[0]
+        setup, parameters, posterior, used, gain, p_value, evidence, birge, wander_s, model[0]
     )
 
 
@@ -238,24 +232,20 @@ def _widened(factor: FloatArray, *added: Hypothesis) -> FloatArray:
     return np.concatenate([factor, *(each.factor for each in added)], axis=1)
 
 
-def _select(
-    total: Information, nominal: FloatArray, allowed: list[Hypothesis]
-) -> tuple[list[Hypothesis], dict[Hypothesis, float]]:
-    """Select hypotheses one by one, and return them with the log Bayes factor of each at its turn."""
-    gains: dict[Hypothesis, float] = {}
+def _select(total: Information, nominal: FloatArray, allowed: list[Hypothesis]) -> list[Hypothesis]:
+    """Select hypotheses one by one, and return them in that order."""
+    selected: list[Hypothesis] = []
     factor, remaining = nominal, list(allowed)
     threshold = MIN_LOG_BAYES_FACTOR + math.log(len(allowed))
     while remaining:
         base = total.evidence(factor)
-        found = [total.evidence(_widened(factor, each)) - base for each in remaining]
-        odds = [each.log_prior + gain for each, gain in zip(remaining, found, strict=True)]
+        odds = [each.log_prior + (total.evidence(_widened(factor, each)) - base) for each in remaining]
         best = int(np.argmax(odds))
         if odds[best] < threshold:
             break
-        chosen = remaining.pop(best)
-        gains[chosen] = found[best]
-        factor = _widened(factor, chosen)
-    return list(gains), gains
+        selected.append(remaining.pop(best))
+        factor = _widened(factor, selected[-1])
+    return selected
 
 
 def _estimate(

@@ -10,7 +10,7 @@ from tsgt.geometry.target_calibration.adjustment import (
     NetworkCalibration,
     calibrate_network,
 )
-from tsgt.geometry.target_calibration.causes import Cause, CauseKind, rejected_targets
+from tsgt.geometry.target_calibration.causes import Cause, CauseKind
 from tsgt.geometry.target_calibration.frame_fit import FrameFit, PointName, PointPairs, PointSet, fit_frame
 from tsgt.geometry.target_calibration.network import (
     DATA_SHEET_SIGMA,
@@ -70,7 +70,6 @@ __all__ = [
     "calibrate_prisms",
     "checks",
     "fit_frame",
-    "rejected_targets",
     "sight_error",
     "station_frames",
     "unweighted_frames",

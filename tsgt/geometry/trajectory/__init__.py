@@ -13,25 +13,33 @@ from tsgt.geometry.trajectory.gauss_newton import (
     solve,
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
-from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S
 from tsgt.geometry.trajectory.measurement_factors import (
     LinearisedMeasurements,
     Observations,
     line_of_sight_axes,
     linearise,
 )
-from tsgt.geometry.trajectory.query import Trajectory, ros_covariance, state_at_point, with_second_order_terms
+from tsgt.geometry.trajectory.measurement_window import MeasurementWindow
+from tsgt.geometry.trajectory.query import (
+    QueriedTrajectory,
+    Trajectory,
+    ros_covariance,
+    state_at_point,
+    with_second_order_terms,
+)
 from tsgt.geometry.trajectory.sensitivity import SetupJacobian, coupling
-from tsgt.geometry.trajectory.states import STATE_DIM, States, concatenate_states
+from tsgt.geometry.trajectory.states import POSE_DIM, STATE_DIM, States, concatenate_states
 
 __all__ = [
-    "AMBIGUITY_MARGIN_S",
     "MIN_KNOT_SPACING_S",
+    "POSE_DIM",
     "STATE_DIM",
     "FixedLagSmoother",
     "LinearisedMeasurements",
+    "MeasurementWindow",
     "Observations",
     "Predictions",
+    "QueriedTrajectory",
     "SetupJacobian",
     "Solution",
     "States",

@@ -45,6 +45,7 @@ from tsgt.geometry.trajectory.query import Trajectory
 from tsgt.geometry.trajectory.rest_window import RestWindow
 from tsgt.geometry.trajectory.sensitivity import WindowSensitivity, common_covariance
 from tsgt.geometry.trajectory.states import STATE_DIM, ProcessFactors, States, concatenate_states
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,7 +57,7 @@ if TYPE_CHECKING:
 
 MAX_INITIAL_ITERATIONS = 10  # Six at most if it converges; others are retried
 MIN_MEASUREMENTS_PER_PRISM, MAX_GAP_S = 3, 1.25  # Determine the trajectory without earlier ones
-MIN_PRISMS, MAX_AGE_S = 3, 1.0  # Prisms measured since then: errors of predictions are comparable
+MAX_AGE_S = 1.0  # Prisms measured since then: errors of predictions are comparable
 PREDICTION_NOISE_SCALE = 2.0  # After minutes of steady motion a sudden manoeuvre may come
 _DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0, 10.0, 10.0, 10.0], 3)
 """Sigmas of the first state's error (m, rad, and their first and second time derivatives) once measurements determine it to

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from tsgt.geometry.rigid import FloatArray
     from tsgt.geometry.trajectory.measurement_factors import Observations
+    from tsgt.geometry.trajectory.query import QueriedTrajectory
+    from tsgt.geometry.trajectory.states import States
 
 CONVERGED_SIGMA_RAD = 0.1  # Below, an initialised trajectory is tracked
 LOST_SIGMA_RAD = 0.2
@@ -140,6 +142,22 @@ class MeasurementWindow(ABC):
         if not self._converged:
             self._horizon_s = max(self._horizon_s, before_s)
             self._select(self.observations.time_s >= before_s)
+
+    @abstractmethod
+    def predict(self, time_s: float, *, dim: int) -> tuple[States, FloatArray]:
+        """Return the state at a time, given all so far, and the (1, dim, dim) covariance of its leading error components."""
+
+    @abstractmethod
+    def common_at(self, time_s: float, *, dim: int) -> FloatArray | None:
+        """Return the (1, dim, dim) covariance that the set-up's uncertainty adds to :meth:`predict`; None: unknown."""
+
+    @abstractmethod
+    def trajectory(self) -> QueriedTrajectory:
+        """Return the trajectory over the window and over what the last :meth:`marginalise_before` eliminated."""
+
+    @abstractmethod
+    def smoothed_trajectory(self) -> QueriedTrajectory:
+        """Return the same for states between measurements, with rest as far as the window shows it."""
 
     @abstractmethod
     def _initialise(self, observations: Observations) -> None:

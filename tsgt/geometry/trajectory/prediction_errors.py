@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.trajectory.states import STATE_DIM, States, concatenate_states
+from tsgt.geometry.trajectory.states import POSE_DIM, STATE_DIM, States, concatenate_states
 
 if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
@@ -72,7 +72,7 @@ class PredictionErrorMonitor:
         if not some:
             return
         predicted = concatenate_states([state for state, _ in some])
-        smoothed, covariance = trajectory.at(predicted.time_s, dim=6)
+        smoothed, covariance = trajectory.at(predicted.time_s, dim=POSE_DIM)
         errors = predicted.local_coordinates_about(smoothed)[:, _AXES]
         # The smoothed pose has an error too.
         squares = errors**2 + np.diagonal(covariance, axis1=1, axis2=2)[:, _AXES]

@@ -8,7 +8,7 @@ outside the knots it extrapolates, and the covariance grows with the process noi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -40,6 +40,23 @@ if TYPE_CHECKING:
 
 _CHUNK = 512  # Times per pass; stays in the cache, a third faster than passes of 4096
 _IDENTITY_18 = np.eye(STATE_DIM)[None]
+
+
+class QueriedTrajectory(Protocol):
+    """A trajectory with its uncertainty, over the times of a window."""
+
+    @property
+    def unchanged_until_s(self) -> float:
+        """Time up to which states stay the same, whatever arrives."""
+        ...
+
+    def at(self, time_s: FloatArray, *, dim: int) -> tuple[States, FloatArray]:
+        """Return states at N times, and the (N, dim, dim) covariance of their leading error components."""
+        ...
+
+    def common_at(self, time_s: FloatArray, *, dim: int) -> FloatArray | None:
+        """Return the (N, dim, dim) covariance that the set-up's uncertainty adds; None: unknown."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from tsgt.model import MotionPrior
 
 STATE_DIM = 18  # Components of a state's error
+POSE_DIM = 6  # The first of them: position and rotation
 _MIN_WRAP_RAD = 0.3  # Smaller rotations between two states are never taken the long way round
 
 

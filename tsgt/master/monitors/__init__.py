@@ -4,8 +4,15 @@ In: poses and what they rest on (`observers` connects them with the publisher), 
 recording, and the configured command of a geofence.
 """
 
-from tsgt.master.monitors.disk import DiskMonitor
+from tsgt.master.monitors.disk import RecordingDisk, disk_status
 from tsgt.master.monitors.imu import ImuUseMonitor, OdometryUseMonitor
 from tsgt.master.monitors.observers import GeofenceObserver, layout_monitor
 
-__all__ = ["DiskMonitor", "GeofenceObserver", "ImuUseMonitor", "OdometryUseMonitor", "layout_monitor"]
+__all__ = [
+    "GeofenceObserver",
+    "ImuUseMonitor",
+    "OdometryUseMonitor",
+    "RecordingDisk",
+    "disk_status",
+    "layout_monitor",
+]

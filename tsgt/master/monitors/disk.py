@@ -1,16 +1,25 @@
-"""Detects a disk that is nearly full, is full or fails, for events on the stream. Sans-I/O."""
+"""Detects a disk that is nearly full, is full or fails, for events on the stream; :class:`DiskMonitor` is sans-I/O."""
 
 from __future__ import annotations
 
+import asyncio
 import errno
-from typing import TYPE_CHECKING, Literal
+import shutil
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 from tsgt.master.link_events import MasterEvent
-from tsgt.recording import LOW_DISK_BYTES
+from tsgt.recording import LOW_DISK_BYTES, DiskStatus
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tsgt.clock import Clock
     from tsgt.errors import RecordingError
-    from tsgt.recording import DiskStatus, RecordingStatus
+    from tsgt.master.recording_thread import RecordingThread
+    from tsgt.recording import RecordingStatus
+
+DISK_SPACE_PERIOD_NS = 5_000_000_000
 
 RECOVERY_FACTOR = 1.25  # of that space are free again before the disk counts as recovered
 
@@ -63,6 +72,46 @@ class DiskMonitor:
             f"{_gigabytes(disk.free_bytes)} are free on the disk of the recording, enough for "
             f"{f'about {hours:.0f} h' if hours >= 1 else 'less than an hour'}: free space"
         )
+
+
+class RecordingDisk:
+    """The recording and the space on its disk; ``space`` is None before the first measurement of it."""
+
+    def __init__(
+        self,
+        recording: RecordingThread,
+        path: Path,
+        start_ns: int,
+        disk_status: Callable[[Path], DiskStatus | None],
+    ) -> None:
+        self._recording = recording
+        self._path = path
+        self._monitor = DiskMonitor(start_ns)
+        self._disk_status = disk_status
+        self.space: DiskStatus | None = None
+
+    async def measure_space(self, clock: Clock) -> NoReturn:
+        """Measure the space periodically, in a thread: a disk may not respond."""
+        while True:
+            self.space = await asyncio.to_thread(self._disk_status, self._path.parent)
+            await clock.sleep_until(clock.monotonic_ns() + DISK_SPACE_PERIOD_NS)
+
+    def recording_status(self) -> RecordingStatus:
+        """Return the status of the recording."""
+        return self._recording.status(self._path.name)
+
+    def events(self, now_ns: int) -> list[MasterEvent]:
+        """Return the events of a disk that has filled up, failed or recovered."""
+        return self._monitor.update(now_ns, self.recording_status(), self._recording.error, self.space)
+
+
+def disk_status(directory: Path) -> DiskStatus | None:
+    """Return the space on the disk of a directory; None if it cannot be determined. May wait for the disk."""
+    try:
+        usage = shutil.disk_usage(directory)
+    except OSError:
+        return None
+    return DiskStatus(free_bytes=usage.free, total_bytes=usage.total)
 
 
 def _gigabytes(size: int) -> str:

@@ -8,7 +8,7 @@ configured number of standard deviations, is beyond the boundary, or when there 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import structlog
 
@@ -20,46 +20,15 @@ from tsgt.service import run_command
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tsgt.config import GeofenceConfig
     from tsgt.polygon import Point
     from tsgt.recording import PoseRecord
-
-
-class GeofenceSettings(Protocol):
-    """Settings of a geofence: ``tsgt.config.GeofenceConfig``, which this sans-I/O part may not import."""
-
-    @property
-    def name(self) -> str:
-        """Name in events."""
-
-    @property
-    def allowed_side(self) -> str:
-        """``inside`` or ``outside``: the side on which the robot may be."""
-
-    @property
-    def polygon_m(self) -> Sequence[Point]:
-        """Corners [x, y] in order, in the frame ``station1``; a simple polygon."""
-
-    @property
-    def margin_m(self) -> float:
-        """Required distance to the boundary."""
-
-    @property
-    def sigmas(self) -> float:
-        """Standard deviations of the position that count as uncertainty."""
-
-    @property
-    def hysteresis_m(self) -> float:
-        """Additional distance to the boundary to enter again."""
-
-    @property
-    def lost_after_s(self) -> float:
-        """Time without a valid pose that counts as an exit."""
 
 
 class Geofence(Observer):
     """Monitors one area."""
 
-    def __init__(self, settings: GeofenceSettings) -> None:
+    def __init__(self, settings: GeofenceConfig) -> None:
         self.name = settings.name
         self._settings = settings
         self._edges = edges(settings.polygon_m)

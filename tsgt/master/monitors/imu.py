@@ -107,7 +107,7 @@ def _contradiction(stations: list[int], now_ns: int) -> EventRecord:
     else:
         measured, whose = f"stations {' and '.join(map(str, stations))}", "a tripod or prism"
     message = (
-        f"measurements of {measured} contradicted the IMU and went on from elsewhere: {whose} may have moved; "
+        f"measurements of {measured} contradicted the IMU and then stayed at the new position: {whose} may have moved; "
         "poses are invalid until the master is restarted or takes a new set-up. Check the stations first: tsgt calibrate check"
     )
     station = stations[0] if len(stations) == 1 else None

@@ -12,13 +12,14 @@ import math
 import statistics
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from tsgt.master.publisher import Observer
 from tsgt.model import MIN_PRISMS
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
+    from tsgt.config import FrameWatchConfig
     from tsgt.recording import PoseRecord
 
 QUARTILE = 4
@@ -29,22 +30,6 @@ RESTORED_RATIO = 0.8  # share of the limit below which the alarm ends; hysteresi
 
 MIN_WINDOW_SHARE = 1 / 3  # as many poses as in this share of the window are judged, at least
 MAX_WINDOWS = 12  # over which they are collected if poses have gaps
-
-
-class LayoutMonitorSettings(Protocol):
-    """Settings of the monitor: ``tsgt.config.FrameWatchConfig``, which this sans-I/O part may not import."""
-
-    @property
-    def residual_mm(self) -> float:
-        """Limit of the residual (root mean square over the prisms) of a stationary robot."""
-
-    @property
-    def residual_speed_gain_ms(self) -> float:
-        """Increase of the limit with speed, in mm per m/s."""
-
-    @property
-    def window_s(self) -> float:
-        """Three of four poses over this time have to exceed the limit; over a longer time if poses have gaps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +50,7 @@ class _Sample:
 class LayoutMonitor(Observer):
     """Monitors the residuals of the prisms against their layout. ``period_ns``: interval of the poses in ns."""
 
-    def __init__(self, settings: LayoutMonitorSettings, period_ns: int) -> None:
+    def __init__(self, settings: FrameWatchConfig, period_ns: int) -> None:
         self._settings = settings
         self._window_ns = round(settings.window_s * 1e9)
         self._min_samples = max(1, math.ceil(MIN_WINDOW_SHARE * self._window_ns / period_ns))

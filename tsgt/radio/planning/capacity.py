@@ -109,31 +109,29 @@ def classic_cycle(
     *,
     resync_cycles: int,
     resync_interval_ns: int,
-    host_ns: int = HOST_NS,
 ) -> CycleEstimate:
     """Predict the paper's protocol, long after the first synchronisation.
 
     ``resync_cycles``, ``resync_interval_ns``: cycles of a station's resynchronisation, and the interval between two.
-    ``host_ns``: turnaround of each computer.
     """
     success = load.exchange_success
     request_ns = timing.airtime_ns(COMMAND_BYTES)
 
     def exchange_ns(reply_bytes: int) -> float:
         """Return the mean duration of a request with its reply or its timeout."""
-        replied_ns = timing.airtime_ns(reply_bytes) + 2 * timing.rx_done_ns + host_ns
+        replied_ns = timing.airtime_ns(reply_bytes) + 2 * timing.rx_done_ns + HOST_NS
         missed_ns = TX_DONE_NS + timing.timeout_ns(reply_bytes)
-        return request_ns + success * replied_ns + (1 - success) * missed_ns + host_ns
+        return request_ns + success * replied_ns + (1 - success) * missed_ns + HOST_NS
 
     cycle_ns = load.stations * exchange_ns(MEASUREMENT_BYTES)
-    once_ns = 3 * (request_ns + host_ns)  # one p, two c
+    once_ns = 3 * (request_ns + HOST_NS)  # one p, two c
     resync_ns = once_ns + resync_cycles * (exchange_ns(PING_REPLY_BYTES) + exchange_ns(TIME_REPLY_BYTES))
     polling = max(1 - load.stations * resync_ns / resync_interval_ns, 0.0)
     # A measurement is lost when the next one is made before a poll succeeds.
     polls = load.period_ns / cycle_ns
     delivered = success * polls if polls < 1 else 1 - (1 - success) ** polls
     wait_ns = min(cycle_ns, load.period_ns)
-    transport_ns = host_ns + timing.airtime_ns(MEASUREMENT_BYTES) + timing.rx_done_ns
+    transport_ns = HOST_NS + timing.airtime_ns(MEASUREMENT_BYTES) + timing.rx_done_ns
     return CycleEstimate(
         cycle_ms=cycle_ns / 1e6,
         rate_hz=polling * delivered * load.rate_hz,

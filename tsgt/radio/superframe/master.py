@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from tsgt.errors import MessageError
-from tsgt.radio.airtime import TX_DONE_NS, symbol_time_ns
+from tsgt.radio.airtime import TX_DONE_NS
 from tsgt.radio.superframe.demand import DEFAULT_GRANT, DemandEstimator, max_grant, retry_stations
 from tsgt.radio.superframe.reception import ReplyTiming
 from tsgt.radio.superframe.session import full_counter
@@ -50,14 +50,14 @@ MAX_FRAMES_PER_SESSION = (1 << 24) - 1  # the frame counter has 24 bits; a new s
 SESSION_INTERVAL = 32
 SESSION_INTERVAL_JOINING = 4
 SESSION_STARTUP_FRAMES = 12
-"""Beacons with session info, which a station needs to join: one in 32, one in 4 while a station is missing, and all of
+"""Beacons with a session item, which a station needs to join: one in 32, one in 4 while a station is missing, and all of
 the first 12."""
 
 EXCHANGES_PER_FRAME = 3  # with more stations their initial two-way exchanges are spread over several frames
 
 REJOIN_FRAMES = 4  # a station that was silent for more frames may have to join again
 
-ABSENT_FRAMES = 20  # a station that was silent for more frames has a slot only in frames with session info
+ABSENT_FRAMES = 20  # a station that was silent for more frames has a slot only in frames with a session item
 
 IDLE_FRAME_NS = 400_000_000  # length of a frame without slots
 
@@ -108,7 +108,7 @@ class SuperframeMaster:
         phase_lock: PhaseLock | None = None,
         records: bool = True,
     ) -> None:
-        symbol_ns = symbol_time_ns(timing.settings.spreading_factor, timing.settings.bandwidth_hz)
+        symbol_ns = timing.settings.symbol_ns
         interval = math.ceil(len(prisms) / EXCHANGES_PER_FRAME)
         self._stations = {
             number: StationState(
@@ -217,7 +217,7 @@ class SuperframeMaster:
         return received
 
     def _is_other_beacon(self, payload: bytes) -> bool:
-        """Whether a packet is an authentic beacon of another session; told by those with session info only."""
+        """Whether a packet is an authentic beacon of another session; recognised by those with a session item only."""
         content, code = payload[:-CODE_BYTES], payload[-CODE_BYTES:]
         try:
             beacon = decode_beacon(content)

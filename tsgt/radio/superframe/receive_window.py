@@ -28,12 +28,12 @@ _start = attrgetter("start")
 
 
 class SequenceSet:
-    """Set of sequence numbers, stored as its gaps and its highest number; initially all numbers below ``first``."""
+    """Set of sequence numbers, stored as its gaps and its highest number."""
 
     __slots__ = ("_gaps", "highest")
 
-    def __init__(self, first: int) -> None:
-        self.highest = first - 1
+    def __init__(self) -> None:
+        self.highest = -1
         self._gaps: list[range] = []
 
     def __contains__(self, number: int) -> bool:
@@ -90,8 +90,8 @@ class _Stream:
     ``reused``: numbers of measurements of an earlier run that are not recorded yet, which the present run uses again.
     """
 
-    received: SequenceSet = field(default_factory=lambda: SequenceSet(0))
-    recorded: SequenceSet = field(default_factory=lambda: SequenceSet(0))
+    received: SequenceSet = field(default_factory=SequenceSet)
+    recorded: SequenceSet = field(default_factory=SequenceSet)
     pending: set[int] = field(default_factory=set)
     reused: Counter[int] = field(default_factory=Counter)
     first_sequence: int | None = None

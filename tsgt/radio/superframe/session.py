@@ -115,7 +115,7 @@ class StationSession:
     Parameters
     ----------
     beacon, info
-        The first beacon, and its session info.
+        The first beacon, and its session item.
     nonce
         The station's nonce in this session, 32 bits.
     boot, clocks
@@ -367,5 +367,5 @@ def _frame_timing(settings: LoRaSettings, info: SessionInfo) -> FrameTiming:
 
 
 def full_counter(info: SessionInfo, beacon: Beacon) -> int:
-    """Return the full frame counter of a beacon with session info."""
+    """Return the full frame counter of a beacon with a session item."""
     return info.counter_high << _FRAME_BITS | beacon.frame

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.radio.airtime import TX_DONE_NS, airtime_us, rx_done_ns, symbol_time_ns
+from tsgt.radio.airtime import TX_DONE_NS
 from tsgt.radio.superframe.wire import GRANT_BYTES
 
 if TYPE_CHECKING:
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 GUARD_UNIT_NS = 250_000  # unit of guard time and turnaround in a beacon
 
-COMPOSE_LEAD_NS = 6_000_000  # how long before its slot a station composes its reply
+COMPOSE_LEAD_NS = 6_000_000
+"""How long before its slot a station composes its reply: the radio needs 3 ms, a Raspberry Pi the rest."""
 
 EXACT_SIGMA_NS = 100_000
 """A timestamp with a larger sigma was made without the edge or without kernel support, and measures no delay."""
@@ -65,28 +66,18 @@ class FrameTiming:
         clock_error_ppm
             Maximum rate difference of two clocks.
         """
-        symbol_ns = symbol_time_ns(settings.spreading_factor, settings.bandwidth_hz)
         drift_ns = MAX_FRAME_NS * clock_error_ppm * 1e-6
-        guard_ns = start_jitter_ns + drift_ns + _TIMESTAMP_SYMBOLS * symbol_ns
+        guard_ns = start_jitter_ns + drift_ns + _TIMESTAMP_SYMBOLS * settings.symbol_ns
         return cls(settings, _rounded_up(guard_ns), _rounded_up(turnaround_ns))
 
     def airtime_ns(self, payload_bytes: int) -> int:
         """Return the airtime of a packet."""
-        settings = self.settings
-        return 1000 * airtime_us(
-            payload_bytes,
-            spreading_factor=settings.spreading_factor,
-            bandwidth_hz=settings.bandwidth_hz,
-            coding_rate=settings.coding_rate,
-            preamble_symbols=settings.preamble_symbols,
-            crc=settings.crc,
-            low_data_rate=settings.low_data_rate,
-        )
+        return self.settings.airtime_ns(payload_bytes)
 
     @property
     def reception_ns(self) -> int:
         """Nominal delay from the end of a packet on the air to RxDone."""
-        return rx_done_ns(self.settings.spreading_factor, self.settings.bandwidth_hz)
+        return self.settings.rx_done_ns
 
     @property
     def link_ns(self) -> int:
@@ -96,8 +87,7 @@ class FrameTiming:
     @property
     def tolerance_ns(self) -> int:
         """By how much a late packet may overlap the next preamble without loss."""
-        symbol_ns = symbol_time_ns(self.settings.spreading_factor, self.settings.bandwidth_hz)
-        return round(OVERLAP_SYMBOLS * symbol_ns)
+        return round(OVERLAP_SYMBOLS * self.settings.symbol_ns)
 
     def slots(self, grants: Sequence[int], order: SlotOrder) -> list[Slot | None]:
         """Return the slots by station index; None for a station without a slot."""

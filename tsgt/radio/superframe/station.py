@@ -61,7 +61,7 @@ class SuperframeStation:
     Attributes
     ----------
     authentication_failures
-        Packets that looked like a beacon with session info and had a wrong code.
+        Packets that looked like a beacon with a session item and had a wrong code.
     missed_slots
         Slots left empty because the computer was late, or overrun.
     rejected_beacons

@@ -100,10 +100,6 @@ class Wiring:
             raise RadioSettingsError(f"spi_hz must be at most 10000000, got {self.spi_hz}")
 
 
-DRAGINO_HAT = Wiring(reset_pin=17, dio0_pin=4, nss_pin=25)
-"""The Dragino LoRa/GPS HAT has its chip select on BCM 25, not on CE0 or CE1."""
-
-
 def open_hal(wiring: Wiring) -> Hal:
     """Open bus and pins on a Raspberry Pi.
 

@@ -14,24 +14,17 @@ _GREETING_LINES = 2
 """The greeting and the newest set-up."""
 
 
-def is_part_of_stream(master_log: MasterLog, heard: Sequence[int]) -> bool:
-    """Whether a reader's lines, as hashes, are the greeting, a published set-up, and then successive lines of the stream."""
-    lines = array("q", heard[_GREETING_LINES:])
-    if len(heard) >= _GREETING_LINES and heard[1] not in master_log.setup_hashes:
-        return False
-    published = master_log.line_hashes
-    starts = (at for at, line in enumerate(published) if line == lines[0]) if lines else ()
-    return not lines or any(published[at : at + len(lines)] == lines for at in starts)
+def heard_failures(master_log: MasterLog, connections: Sequence[Sequence[int]]) -> Iterator[str]:
+    """Yield the connections in which a reader did not get successive lines of the stream, after greeting and set-up.
 
-
-def heard_failures(master_log: MasterLog) -> Iterator[str]:
-    """Yield the connections in which a reader did not get successive lines of the stream, after greeting and set-up."""
+    ``connections``: hashes of the lines that it got in each.
+    """
     published = master_log.line_hashes
     places: dict[int, list[int]] = {}
     for place, line in enumerate(published):
         places.setdefault(line, []).append(place)
-    for number, heard in enumerate(master_log.heard, 1):
-        lines = heard[_GREETING_LINES:]
+    for number, heard in enumerate(connections, 1):
+        lines = array("q", heard[_GREETING_LINES:])
         if len(heard) >= _GREETING_LINES and heard[1] not in master_log.setup_hashes:
             yield f"connection {number}: the second line is no set-up that was published"
         if not lines or any(published[at : at + len(lines)] == lines for at in places.get(lines[0], ())):

@@ -15,6 +15,7 @@ import numpy as np
 
 from tsgt.config import scenario_parameters
 from tsgt.errors import StreamError
+from tsgt.recording import MAX_LINE_BYTES
 from tsgt.simulation.demo.imu import ImuServer
 from tsgt.simulation.demo.processes import Process
 from tsgt.simulation.imu import IMU_MODELS, ImuProgram, simulate_imu
@@ -36,7 +37,6 @@ STARTUP_TIMEOUT_S = 60.0
 """From the start of the daemons to the first pose; a slow machine takes five seconds."""
 
 _SHAKING_SEED = 0x5A
-_MAX_LINE_BYTES = 1 << 20
 _RECONNECT_DELAY_S = 0.2
 _FINAL_READ_TIMEOUT_S = 2.0
 
@@ -163,7 +163,7 @@ class Demo:
         """Read the stream until the end; reconnect after a restart of the master."""
         while not self._ending:
             with suppress(OSError):
-                reader, writer = await asyncio.open_unix_connection(self._files.socket, limit=_MAX_LINE_BYTES)
+                reader, writer = await asyncio.open_unix_connection(self._files.socket, limit=MAX_LINE_BYTES)
                 try:
                     while line := await reader.readline():
                         if line.startswith(b'{"type":"pose"'):

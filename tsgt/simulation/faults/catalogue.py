@@ -295,6 +295,12 @@ def parse_faults(text: str) -> frozenset[FaultKind]:
     return frozenset(map(FaultKind, names))
 
 
+def log_uniform(rng: np.random.Generator, span: tuple[float, float]) -> float:
+    """Draw between two positive values, uniformly in the logarithm."""
+    low, high = span
+    return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+
 def draw_faults(
     kinds: Iterable[FaultKind],
     rng: np.random.Generator,
@@ -334,7 +340,7 @@ def draw_faults(
                 at_s = rng.uniform(FAULT_FREE_START_S, max(FAULT_FREE_START_S, until_s))
                 shortest, longest = rate.duration_s
                 # Log-uniform durations.
-                duration_s = shortest and math.exp(rng.uniform(math.log(shortest), math.log(longest)))
+                duration_s = shortest and log_uniform(rng, rate.duration_s)
                 duration_s = duration_s or (rng.uniform(0, longest) if longest else 0.0)
                 faults.append(
                     Fault(

@@ -6,8 +6,9 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from tsgt.simulation.faults.catalogue import FaultKind
+from tsgt.simulation.faults.targets import target_computer, target_station
 from tsgt.simulation.kernel import DriftingClock
-from tsgt.simulation.mission import MASTER, station_name
+from tsgt.simulation.mission import station_name
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -26,7 +27,7 @@ _NTP_AFTER_BOOT_S: Final = (1.0, 15.0)
 
 
 async def _slow_disk(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    disk = mission.computers[MASTER if fault.station is None else station_name(fault.station)].disk
+    disk = mission.computers[target_computer(fault)].disk
     ends_s = fault.at_s + fault.duration_s
     while (now_s := mission.now_s) < ends_s:
         until_s = min(now_s + rng.uniform(*_DISK_STALL_S), ends_s)
@@ -36,11 +37,11 @@ async def _slow_disk(mission: Mission, fault: Fault, rng: np.random.Generator) -
 
 
 async def _suspend(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
-    await mission.suspend(_station(fault), fault.duration_s)
+    await mission.suspend(target_station(fault), fault.duration_s)
 
 
 async def _ntp_boot_step(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    station = _station(fault)
+    station = target_station(fault)
     await mission.reboot(station, fault.at_s, fault.duration_s)
     await asyncio.sleep(rng.uniform(*_NTP_AFTER_BOOT_S))
     clock = mission.computers[station_name(station)].clock
@@ -48,21 +49,15 @@ async def _ntp_boot_step(mission: Mission, fault: Fault, rng: np.random.Generato
 
 
 async def _ntp_slew(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    clock = mission.computers[station_name(_station(fault))].clock
-    if not isinstance(clock, DriftingClock) or _station(fault) in mission.drifting:
+    clock = mission.computers[station_name(target_station(fault))].clock
+    if not isinstance(clock, DriftingClock) or target_station(fault) in mission.drifting:
         return
-    mission.drifting.add(_station(fault))
+    mission.drifting.add(target_station(fault))
     ppm = NTP_SLEW_PPM * rng.choice([-1.0, 1.0])
     clock.change_drift(ppm)
     await asyncio.sleep(fault.duration_s)
     clock.change_drift(-ppm)
-    mission.drifting.discard(_station(fault))
-
-
-def _station(fault: Fault) -> int:
-    if fault.station is None:
-        raise ValueError(f"a fault {fault.kind} needs a station")
-    return fault.station
+    mission.drifting.discard(target_station(fault))
 
 
 COMPUTER_INJECTORS: Final[

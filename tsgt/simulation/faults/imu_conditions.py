@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tsgt.simulation.faults.catalogue import FaultKind
+from tsgt.simulation.faults.catalogue import FaultKind, log_uniform
 from tsgt.simulation.imu import (
     DeviceClockJump,
     Dropout,
@@ -48,7 +48,7 @@ def _condition(fault: Fault, rng: np.random.Generator) -> ImuCondition | None:
         case FaultKind.IMU_STUCK:
             return StuckValues(fault.at_s, fault.duration_s)
         case FaultKind.IMU_CLOCK_JUMP:
-            size_s = math.exp(rng.uniform(math.log(_JUMP_S[0]), math.log(_JUMP_S[1])))
+            size_s = log_uniform(rng, _JUMP_S)
             return DeviceClockJump(fault.at_s, float(rng.choice((-1.0, 1.0))) * size_s)
         case FaultKind.IMU_LATE_BURST:
             return LateBurst(fault.at_s, fault.duration_s)

@@ -15,11 +15,12 @@ from tsgt.simulation.faults.computers import COMPUTER_INJECTORS
 from tsgt.simulation.faults.operations import OPERATION_INJECTORS
 from tsgt.simulation.faults.optics import OPTICS_INJECTORS
 from tsgt.simulation.faults.setup_mistakes import MISTAKE_INJECTORS
+from tsgt.simulation.faults.targets import target_computer, target_station
 from tsgt.simulation.faults.tripods import TRIPOD_INJECTORS
 from tsgt.simulation.instrument import LineFault, Lock
 from tsgt.simulation.kernel import DriftingClock
 from tsgt.simulation.lora.adversary import MAX_NOISE_BYTES, ReplayAttacker
-from tsgt.simulation.mission import MASTER, station_name
+from tsgt.simulation.mission import MASTER
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -51,16 +52,6 @@ async def inject_fault(mission: Mission, fault: Fault) -> None:
     await _INJECTORS[fault.kind](mission, fault, np.random.default_rng(fault.seed))
 
 
-def _computer_name(fault: Fault) -> str:
-    return MASTER if fault.station is None else station_name(fault.station)
-
-
-def _station(fault: Fault) -> int:
-    if fault.station is None:
-        raise ValueError(f"a fault {fault.kind} needs a station")
-    return fault.station
-
-
 async def relock_instruments(mission: Mission, at_s: float) -> None:
     """Relock all instruments on their prisms at a time, and check repeatedly that they are locked."""
     for check_s in (at_s, *(at_s + after_s for after_s in _RELOCK_CHECKS_S)):
@@ -81,7 +72,7 @@ def _lock_manually(mission: Mission, number: int) -> None:
 
 async def _loss(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     """Lose packets with a random probability, with a new draw every 150 ms on average."""
-    probability, name = rng.uniform(0.2, 1.0), _computer_name(fault)
+    probability, name = rng.uniform(0.2, 1.0), target_computer(fault)
     while mission.now_s < fault.at_s + fault.duration_s:
         lost = rng.random() < probability
         mission.air.link.set_attenuation(MASTER, name, _OUTAGE_DB if lost else 0.0)
@@ -137,12 +128,12 @@ async def _use_interferer(
 
 
 async def _chip_reset(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
-    if (hardware := mission.computers[_computer_name(fault)].hardware) is not None:
+    if (hardware := mission.computers[target_computer(fault)].hardware) is not None:
         hardware.chip.power_on_reset()
 
 
 async def _chip_hang(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
-    if (hardware := mission.computers[_computer_name(fault)].hardware) is not None:
+    if (hardware := mission.computers[target_computer(fault)].hardware) is not None:
         hardware.chip.hang()
 
 
@@ -151,15 +142,15 @@ async def _bus(mission: Mission, fault: Fault, rng: np.random.Generator) -> None
     level = bool(rng.random() < 0.5)
     ends_s = fault.at_s + fault.duration_s
     while mission.now_s < ends_s:
-        if (hardware := mission.computers[_computer_name(fault)].hardware) is not None:
+        if (hardware := mission.computers[target_computer(fault)].hardware) is not None:
             hardware.chip.disconnect_bus(level)
         await asyncio.sleep(0.05)
-    if (hardware := mission.computers[_computer_name(fault)].hardware) is not None:
+    if (hardware := mission.computers[target_computer(fault)].hardware) is not None:
         hardware.chip.reconnect_bus()
 
 
 async def _interrupts(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    hardware = mission.computers[_computer_name(fault)].hardware
+    hardware = mission.computers[target_computer(fault)].hardware
     if hardware is None:
         return
     if rng.random() < 0.3:
@@ -172,7 +163,7 @@ async def _interrupts(mission: Mission, fault: Fault, rng: np.random.Generator) 
 
 
 async def _unplug(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    number = _station(fault)
+    number = target_station(fault)
     mission.lines[number].plugged = False
     await asyncio.sleep(fault.duration_s)
     mission.lines[number].plugged = True
@@ -186,41 +177,41 @@ async def _unplug(mission: Mission, fault: Fault, rng: np.random.Generator) -> N
 async def _line(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     share = rng.choice([0.02, 0.1, 0.4])
     while mission.now_s < fault.at_s + fault.duration_s:
-        script = mission.lines[_station(fault)].faults.script
+        script = mission.lines[target_station(fault)].faults.script
         script.clear()
         for _ in range(_SCRIPTED_RESPONSES):
             hit = rng.random() < share
             script.append(_LINE_FAULTS[rng.integers(len(_LINE_FAULTS))] if hit else LineFault.NONE)
         await asyncio.sleep(min(1.0, max(0.01, fault.at_s + fault.duration_s - mission.now_s)))
-    mission.lines[_station(fault)].faults.script.clear()
+    mission.lines[target_station(fault)].faults.script.clear()
 
 
 async def _stall(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     which = "drop_responses" if rng.random() < 0.5 else "drop_requests"
-    setattr(mission.lines[_station(fault)].faults, which, True)
+    setattr(mission.lines[target_station(fault)].faults, which, True)
     await asyncio.sleep(fault.duration_s)
     # A reboot may have replaced the line.
-    setattr(mission.lines[_station(fault)].faults, which, False)
+    setattr(mission.lines[target_station(fault)].faults, which, False)
 
 
 async def _power(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    instrument = mission.instruments[_station(fault)]
+    instrument = mission.instruments[target_station(fault)]
     instrument.switch_off()
     await asyncio.sleep(fault.duration_s)
     instrument.switch_on()
     await asyncio.sleep(rng.uniform(*RELOCK_DELAY_S))
-    _lock_manually(mission, _station(fault))
+    _lock_manually(mission, target_station(fault))
 
 
 async def _prism_loss(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
-    instrument = mission.instruments[_station(fault)]
+    instrument = mission.instruments[target_station(fault)]
     instrument.blocked = True
     await asyncio.sleep(fault.duration_s)
     instrument.blocked = False
 
 
 async def _wrong_prism(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    number = _station(fault)
+    number = target_station(fault)
     others = [prism for prism in mission.prisms.values() if prism != mission.prisms[number]]
     if not others or not mission.instruments[number].on:
         return
@@ -234,19 +225,19 @@ async def _wrong_prism(mission: Mission, fault: Fault, rng: np.random.Generator)
 
 async def _drift(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     """Change the drift of a clock at a constant rate."""
-    clock = mission.computers[_computer_name(fault)].clock
+    clock = mission.computers[target_computer(fault)].clock
     ppm_per_s = rng.uniform(-1, 1) * _RAMP_PPM_PER_S[mission.superframe]
     if not isinstance(clock, DriftingClock) or fault.station in mission.drifting:
         return
-    mission.drifting.add(_station(fault))
+    mission.drifting.add(target_station(fault))
     for _ in range(round(fault.duration_s)):
         clock.change_drift(ppm_per_s)
         await asyncio.sleep(1.0)
-    mission.drifting.discard(_station(fault))
+    mission.drifting.discard(target_station(fault))
 
 
 async def _clock_step(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    mission.computers[_computer_name(fault)].clock.step(_step_ns(rng, _STEP_S))
+    mission.computers[target_computer(fault)].clock.step(_step_ns(rng, _STEP_S))
 
 
 async def _master_clock_step(mission: Mission, _fault: Fault, rng: np.random.Generator) -> None:
@@ -259,7 +250,7 @@ def _step_ns(rng: np.random.Generator, span_s: tuple[float, float]) -> int:
 
 
 async def _reboot(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
-    await mission.reboot(_station(fault), fault.at_s, fault.duration_s)
+    await mission.reboot(target_station(fault), fault.at_s, fault.duration_s)
 
 
 async def _crash(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
@@ -273,13 +264,13 @@ async def _crash(mission: Mission, fault: Fault, rng: np.random.Generator) -> No
         await asyncio.sleep(rng.choice([0.0, 0.05, 0.09]))
     for _ in range(int(rng.integers(_MAX_LOOP_ROUNDS))):
         await asyncio.sleep(0)
-    await mission.crash(_computer_name(fault), down_s=fault.duration_s)
+    await mission.crash(target_computer(fault), down_s=fault.duration_s)
 
 
 async def _torn_write(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     torn = asyncio.Event()
     loop = asyncio.get_running_loop()
-    computer = mission.computers[_computer_name(fault)]
+    computer = mission.computers[target_computer(fault)]
     if (writes := computer.disk_writer) is None:
         return
     writes.tear_next_write(rng.random(), partial(loop.call_soon_threadsafe, torn.set))
@@ -292,7 +283,7 @@ async def _torn_write(mission: Mission, fault: Fault, rng: np.random.Generator) 
 
 
 async def _disk(error: int, mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
-    disk = mission.computers[_computer_name(fault)].disk
+    disk = mission.computers[target_computer(fault)].disk
     disk.fail_writes(error, round(fault.at_s * 1e9), round((fault.at_s + fault.duration_s) * 1e9))
     await asyncio.sleep(fault.duration_s)
     disk.write_error = None

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from tsgt.config import ReferencePointConfig
 from tsgt.simulation.faults.catalogue import FaultKind
-from tsgt.simulation.mission import MASTER, MasterEdit, SetupMistake, station_name
+from tsgt.simulation.faults.targets import target_computer
+from tsgt.simulation.mission import MasterEdit, SetupMistake
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -62,7 +63,7 @@ async def _master_suspend(mission: Mission, fault: Fault, _rng: np.random.Genera
 
 
 async def _long_disk_full(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:
-    disk = mission.computers[MASTER if fault.station is None else station_name(fault.station)].disk
+    disk = mission.computers[target_computer(fault)].disk
     disk.fail_writes(errno.ENOSPC, round(fault.at_s * 1e9), round((fault.at_s + fault.duration_s) * 1e9))
     await asyncio.sleep(fault.duration_s)
     disk.write_error = None

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tsgt.geometry import exp_so3, transform_points
-from tsgt.simulation.faults.catalogue import RELOCK_DELAY_S, FaultKind
+from tsgt.simulation.faults.catalogue import RELOCK_DELAY_S, FaultKind, log_uniform
+from tsgt.simulation.faults.targets import target_station
 from tsgt.simulation.instrument.optical_disturbances import HeatShimmer, Multipath, Rain
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ async def _shimmer(mission: Mission, fault: Fault, rng: np.random.Generator) -> 
     if _is_disturbed_by(HeatShimmer, mission):
         return
     noon, hour, correlation_s = (
-        _log_uniform(rng, _NOON_STRUCTURE),
+        log_uniform(rng, _NOON_STRUCTURE),
         rng.uniform(*_HOURS),
         rng.uniform(*_CORRELATION_S),
     )
@@ -62,7 +63,7 @@ async def _shimmer(mission: Mission, fault: Fault, rng: np.random.Generator) -> 
 async def _rain(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     if _is_disturbed_by(Rain, mission):
         return
-    rate_mmph = _log_uniform(rng, _RAIN_MMPH)
+    rate_mmph = log_uniform(rng, _RAIN_MMPH)
     generators = rng.spawn(len(mission.instruments))
     drops = [
         asyncio.create_task(_lose_locks(instrument, fault.duration_s, rate_mmph, each))
@@ -81,7 +82,7 @@ async def _lose_locks(
     left_s = for_s
     while left_s > (until_s := rng.exponential(mean_s)):
         await asyncio.sleep(until_s)
-        hidden_s = min(_log_uniform(rng, _LOCK_LOSS_S), left_s - until_s)
+        hidden_s = min(log_uniform(rng, _LOCK_LOSS_S), left_s - until_s)
         instrument.blocked = True
         await asyncio.sleep(hidden_s)
         instrument.blocked = False
@@ -108,7 +109,7 @@ async def _disturb_all(mission: Mission, fault: Fault, disturbances: Sequence[Op
 
 async def _second_robot(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     """Let another robot pass behind or before the robot, in line with a station; all instruments see its prisms."""
-    station, until_s = _station(fault), fault.at_s + fault.duration_s
+    station, until_s = target_station(fault), fault.at_s + fault.duration_s
     pose = mission.world.pose_at(np.array([fault.at_s]))[0]
     frame = next(each for each in mission.parameters.stations if each.station == station)
     line_of_sight = pose[:3, 3] - np.array(frame.T_station1_station)[:3, 3]
@@ -136,19 +137,19 @@ async def _second_robot(mission: Mission, fault: Fault, rng: np.random.Generator
 
 
 async def _window(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    instrument = mission.instruments[_station(fault)]
+    instrument = mission.instruments[target_station(fault)]
     if rng.random() < 0.5:
-        multipath = Multipath(_log_uniform(rng, _MULTIPATH_M))
+        multipath = Multipath(log_uniform(rng, _MULTIPATH_M))
         instrument.disturbances.append(multipath)
         await asyncio.sleep(fault.duration_s)
         instrument.disturbances.remove(multipath)
         return
-    prism = mission.prisms[_station(fault)]
+    prism = mission.prisms[target_station(fault)]
     position_m = next(each.position_m for each in mission.parameters.prisms if each.prism == prism)
     towards = rng.uniform(0.0, math.tau)
     normal = np.array([math.cos(towards), math.sin(towards), 0.0])
     at_start = _positions(mission, position_m, np.array([fault.at_s]))[0]
-    surface_m = at_start + _log_uniform(rng, _MIRROR_M) * normal
+    surface_m = at_start + log_uniform(rng, _MIRROR_M) * normal
 
     def image(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
         points = _positions(mission, position_m, times_s)
@@ -160,7 +161,7 @@ async def _window(mission: Mission, fault: Fault, rng: np.random.Generator) -> N
 
 
 async def _battery_fading(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    number = _station(fault)
+    number = target_station(fault)
     instrument = mission.instruments[number]
     begin_percent = rng.uniform(*_NEARLY_EMPTY_PERCENT)
     fades_s = max((1 - _DEAD_SHARE) * fault.duration_s, _FADING_STEP_S)
@@ -186,17 +187,6 @@ def _positions(
     """Return the positions of a prism of the robot in ``station1``, (N, 3), at any N instants."""
     inside_s = np.clip(times_s, 0.0, mission.world.duration_s)
     return transform_points(mission.world.pose_at(inside_s), np.array(position_m))
-
-
-def _log_uniform(rng: np.random.Generator, span: tuple[float, float]) -> float:
-    low, high = span
-    return math.exp(rng.uniform(math.log(low), math.log(high)))
-
-
-def _station(fault: Fault) -> int:
-    if fault.station is None:
-        raise ValueError(f"a fault {fault.kind} needs a station")
-    return fault.station
 
 
 OPTICS_INJECTORS: Final[

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from tsgt.config import MAX_STATION_NUMBERS
+from tsgt.radio.superframe.wire import KEY_BYTES
 from tsgt.simulation.faults.catalogue import FaultKind
+from tsgt.simulation.faults.targets import target_station
 from tsgt.simulation.mission import SetupMistake
 
 if TYPE_CHECKING:
@@ -16,27 +18,22 @@ if TYPE_CHECKING:
     from tsgt.simulation.faults.catalogue import Fault
     from tsgt.simulation.mission import Mission
 
-_KEY_BYTES = 32
 _ROUND_PRISM_MM: Final = 34.4
 
 
 async def _mistake(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    if fault.station is None:
-        raise ValueError(f"a fault {fault.kind} needs a station")
-    numbers = list(mission.station_logs)
+    station, numbers = target_station(fault), list(mission.station_logs)
     mistakes = {
-        FaultKind.WRONG_KEY: SetupMistake(key=rng.bytes(_KEY_BYTES)),
+        FaultKind.WRONG_KEY: SetupMistake(key=rng.bytes(KEY_BYTES)),
         FaultKind.OTHER_SPREADING_FACTOR: SetupMistake(spreading_factor=8),
         FaultKind.OTHER_PROTOCOL: SetupMistake(classic=True),
         FaultKind.UNKNOWN_STATION: SetupMistake(
             station=MAX_STATION_NUMBERS["superframe" if mission.superframe else "classic"]
         ),
-        FaultKind.SAME_STATION: SetupMistake(
-            station=numbers[(numbers.index(fault.station) + 1) % len(numbers)]
-        ),
+        FaultKind.SAME_STATION: SetupMistake(station=numbers[(numbers.index(station) + 1) % len(numbers)]),
         FaultKind.PRISM_CONSTANT: SetupMistake(prism_constant_mm=_ROUND_PRISM_MM),
     }
-    await mission.make_mistake(fault.station, mistakes[fault.kind], fault.at_s + fault.duration_s)
+    await mission.make_mistake(station, mistakes[fault.kind], fault.at_s + fault.duration_s)
 
 
 async def _second_master(mission: Mission, fault: Fault, _rng: np.random.Generator) -> None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from tsgt.simulation.faults.catalogue import FaultKind
+from tsgt.simulation.faults.catalogue import FaultKind, log_uniform
+from tsgt.simulation.faults.targets import target_station
 from tsgt.simulation.world import STOP_S, Rollover
 
 if TYPE_CHECKING:
@@ -51,28 +52,28 @@ async def _sink(mission: Mission, fault: Fault, rng: np.random.Generator) -> Non
     sink_mps = SINK_MPS * SINK_FACTOR ** rng.random()
     while (left_s := fault.at_s + fault.duration_s - mission.now_s) > _RESOLUTION_S:
         await asyncio.sleep(step_s := min(_STEP_S, left_s))
-        mission.move_station(_station(fault), (0.0, 0.0, -sink_mps * step_s), 0.0)
+        mission.move_station(target_station(fault), (0.0, 0.0, -sink_mps * step_s), 0.0)
 
 
 async def _sun(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
-    turn_radps = rng.choice([-1.0, 1.0]) * _log_uniform(rng, SUN_RADPS)
+    turn_radps = rng.choice([-1.0, 1.0]) * log_uniform(rng, SUN_RADPS)
     direction_rad = rng.uniform(0.0, math.tau)
     tilt_radps = _SUN_TILT_RADPS * math.cos(direction_rad), _SUN_TILT_RADPS * math.sin(direction_rad)
-    instrument = mission.instruments[_station(fault)]
+    instrument = mission.instruments[target_station(fault)]
     while (left_s := fault.at_s + fault.duration_s - mission.now_s) > _RESOLUTION_S:
         await asyncio.sleep(step_s := min(_STEP_S, left_s))
         across, along = instrument.tilt_rad
         instrument.tilt_rad = across + tilt_radps[0] * step_s, along + tilt_radps[1] * step_s
-        mission.move_station(_station(fault), (0.0, 0.0, 0.0), turn_radps * step_s)
+        mission.move_station(target_station(fault), (0.0, 0.0, 0.0), turn_radps * step_s)
 
 
 async def _kick(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     """Displace, turn and tilt a tripod at once; beyond the compensator's range, somebody levels it again at the end."""
-    instrument = mission.instruments[_station(fault)]
+    instrument = mission.instruments[target_station(fault)]
     direction = rng.standard_normal(3) * (1.0, 1.0, _DROP_SHARE)
-    shift_m = _log_uniform(rng, KICK_M) * direction / np.linalg.norm(direction)
-    turn_rad = rng.choice([-1.0, 1.0]) * _log_uniform(rng, KICK_RAD)
-    mission.move_station(_station(fault), shift_m.tolist(), turn_rad)
+    shift_m = log_uniform(rng, KICK_M) * direction / np.linalg.norm(direction)
+    turn_rad = rng.choice([-1.0, 1.0]) * log_uniform(rng, KICK_RAD)
+    mission.move_station(target_station(fault), shift_m.tolist(), turn_rad)
     instrument.tilt_rad = _LEVEL_RAD * rng.uniform(-1, 1), _LEVEL_RAD * rng.uniform(-1, 1)
     if rng.random() < _NOT_LEVEL_PROBABILITY:
         level, instrument.tilt_rad = instrument.tilt_rad, (_BEYOND_COMPENSATOR_RAD, 0.0)
@@ -82,16 +83,16 @@ async def _kick(mission: Mission, fault: Fault, rng: np.random.Generator) -> Non
 
 async def _move(mission: Mission, fault: Fault, rng: np.random.Generator) -> None:
     """Carry an instrument to another place, where it has another zero; it measures again, and is calibrated at the end or never."""
-    instrument = mission.instruments[_station(fault)]
+    instrument = mission.instruments[target_station(fault)]
     instrument.blocked = True
     await asyncio.sleep(min(rng.uniform(*_SET_UP_S), fault.duration_s))
     bearing_rad, away_m = rng.uniform(0.0, math.tau), rng.uniform(*_SET_UP_M)
     shift_m = away_m * math.cos(bearing_rad), away_m * math.sin(bearing_rad), _HEIGHT_M * rng.uniform(-1, 1)
-    mission.move_station(_station(fault), shift_m, rng.uniform(-math.pi, math.pi))
+    mission.move_station(target_station(fault), shift_m, rng.uniform(-math.pi, math.pi))
     instrument.tilt_rad = _LEVEL_RAD * rng.uniform(-1, 1), _LEVEL_RAD * rng.uniform(-1, 1)
     instrument.blocked = False
     if instrument.on:
-        instrument.lock_manually(mission.prisms[_station(fault)])
+        instrument.lock_manually(mission.prisms[target_station(fault)])
     await mission.sleep_until(fault.at_s + fault.duration_s)
     if rng.random() < _RECALIBRATED_PROBABILITY:
         await mission.recalibrate()
@@ -110,16 +111,6 @@ def rollovers(faults: Iterable[Fault]) -> tuple[Rollover, ...]:
         if each.at_s >= free_s and fault.duration_s >= 2 * each.roll_s + _ROLLED_BACK_S:
             found.append(each)
     return tuple(found)
-
-
-def _log_uniform(rng: np.random.Generator, span: tuple[float, float]) -> float:
-    return math.exp(rng.uniform(math.log(span[0]), math.log(span[1])))
-
-
-def _station(fault: Fault) -> int:
-    if fault.station is None:
-        raise ValueError(f"a fault {fault.kind} needs a station")
-    return fault.station
 
 
 TRIPOD_INJECTORS: Final[

@@ -15,13 +15,12 @@ from tsgt.simulation.imu.conditions import (
     StuckValues,
 )
 from tsgt.simulation.imu.environment import Environment
-from tsgt.simulation.imu.presets import CONSUMER, IMU_MODELS, INDUSTRIAL, ImuModel
+from tsgt.simulation.imu.presets import IMU_MODELS, INDUSTRIAL
 from tsgt.simulation.imu.program import DeviceProgram, ImuProgram
-from tsgt.simulation.imu.samples import DeviceSamples, ImuTruth, Mounting, SimulatedImuRun
+from tsgt.simulation.imu.samples import DeviceSamples, Mounting, SimulatedImuRun
 from tsgt.simulation.imu.synthesis import ideal_samples, mounting_of, simulate_imu
 
 __all__ = [
-    "CONSUMER",
     "IMU_MODELS",
     "INDUSTRIAL",
     "DeviceClockJump",
@@ -30,9 +29,7 @@ __all__ = [
     "Dropout",
     "Environment",
     "ImuCondition",
-    "ImuModel",
     "ImuProgram",
-    "ImuTruth",
     "Knock",
     "LateBurst",
     "Mounting",

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from tsgt.geometry.inertial import InertialSamples
-
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from tsgt.model import ImuNoise, ImuParameters
@@ -71,13 +68,3 @@ class SimulatedImuRun:
     samples: DeviceSamples
     truth: ImuTruth
     parameters: ImuParameters  # exact unless the scenario has errors of the set-up
-
-    def inertial_samples(self) -> InertialSamples:
-        """Return the samples in the order of time as an estimator takes them: latency and gyro matrix applied exactly."""
-        samples = self.samples.select(np.argsort(self.samples.end_s, kind="stable"))
-        return InertialSamples(
-            samples.end_s,
-            samples.duration_s,
-            samples.angular_rate_radps @ np.linalg.inv(self.truth.gyro_matrix).T,
-            samples.specific_force_mps2,
-        )

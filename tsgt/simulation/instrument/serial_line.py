@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections import deque
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -13,6 +12,7 @@ import numpy as np
 
 from tsgt.errors import InstrumentError
 from tsgt.station.serial import Chunk
+from tsgt.station.serial.chunk_queue import ChunkQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -215,34 +215,22 @@ class _SimulatedPort:
     def __init__(self, wire: Wire, name: str, baud: int, closed: Callable[[_SimulatedPort], None]) -> None:
         self._wire = wire
         self._closed = closed
-        self._chunks: deque[Chunk] = deque()
-        self._waiter: asyncio.Future[None] | None = None
-        self._disconnect_reason = ""
+        self._received = ChunkQueue()
         self.name = name
         self.baud = baud
 
     def write(self, data: bytes) -> None:
         """Send bytes."""
-        self._check()
+        self._received.check()
         self._wire.send(data)
 
     async def read(self) -> Chunk:
         """Return the next bytes."""
-        while not self._chunks:
-            self._check()
-            self._waiter = asyncio.get_running_loop().create_future()
-            try:
-                await self._waiter
-            finally:
-                self._waiter = None
-        return self._chunks.popleft()
+        return await self._received.read()
 
     def drain(self) -> bytes:
         """Return and discard the bytes that have arrived."""
-        self._check()
-        data = b"".join(chunk.data for chunk in self._chunks)
-        self._chunks.clear()
-        return data
+        return self._received.drain()
 
     async def close(self) -> None:
         """Close the port."""
@@ -251,22 +239,12 @@ class _SimulatedPort:
 
     def receive(self, chunk: Chunk) -> None:
         """Queue bytes that have arrived."""
-        self._chunks.append(chunk)
-        self._wake()
+        self._received.put(chunk)
 
     def disconnect(self, why: str) -> None:
         """Make all further calls fail."""
-        self._disconnect_reason = self._disconnect_reason or why
-        self._chunks.clear()
-        self._wake()
-
-    def _check(self) -> None:
-        if self._disconnect_reason:
-            raise InstrumentError(f"{self.name} {self._disconnect_reason}; plug it in and open it again")
-
-    def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        self._received.clear()
+        self._received.fail(f"{self.name} {why}; plug it in and open it again")
 
 
 def line_ns(count: int, baud: int) -> int:

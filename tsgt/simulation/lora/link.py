@@ -143,17 +143,10 @@ def _shadowing(seed: int, one: str, other: str) -> float:
 
 @dataclass(kw_only=True, slots=True)
 class LinkModel:
-    """Path loss, fading and packet loss of the channel.
-
-    Attributes
-    ----------
-    fading_sigma_db
-        One sigma of each frame's power at each receiver: 1 to 3 for stationary radios.
-    """
+    """Path loss, fading and packet loss of the channel."""
 
     path_loss: PathLoss = field(default_factory=FixedLoss)
     noise_figure_db: float = NOISE_FIGURE_DB  # of every receiver
-    fading_sigma_db: float = 0.0
     rayleigh_fading: bool = False  # whether the power has Rayleigh fading, for moving radios
     loss_probability: float = 0.0  # probability that a receiver misses a frame regardless of its power
     _attenuations_db: dict[frozenset[str], float] = field(default_factory=dict, init=False, repr=False)
@@ -163,12 +156,10 @@ class LinkModel:
         self._attenuations_db[frozenset((one, other))] = attenuation_db
 
     def loss_db(self, sender: str, receiver: str, frequency_hz: float, draws: Sequence[float]) -> float:
-        """Return the path loss of one frame; ``draws`` are two uniform draws in (0, 1) for the fading."""
+        """Return the path loss of one frame; the second of ``draws``, uniform in (0, 1), is for the fading."""
         loss_db = self.path_loss.loss_db(sender, receiver, frequency_hz)
         if self._attenuations_db:
             loss_db += self._attenuations_db.get(frozenset((sender, receiver)), 0.0)
-        if self.fading_sigma_db:
-            loss_db += self.fading_sigma_db * normal_quantile(draws[0])
         if self.rayleigh_fading:
             loss_db -= 10 * math.log10(-math.log(draws[1]))
         return loss_db

@@ -7,17 +7,11 @@ the ground truth. `Mission` also starts, stops, kills and reboots computers for 
 from tsgt.simulation.mission.computer import MASTER
 from tsgt.simulation.mission.config_edits import MasterEdit
 from tsgt.simulation.mission.daemon_configs import has_odometry, instrument_config, station_name
+from tsgt.simulation.mission.master_log import MasterLog, ValidPoses
 from tsgt.simulation.mission.mission import DRAIN_S, Mission
-from tsgt.simulation.mission.run_log import (
-    JournalIndex,
-    MasterLog,
-    MissionResult,
-    Slew,
-    StationLog,
-    StationMove,
-    ValidPoses,
-)
+from tsgt.simulation.mission.result import MissionResult, Slew, StationMove
 from tsgt.simulation.mission.setup_mistakes import SetupMistake
+from tsgt.simulation.mission.station_log import JournalIndex, StationLog
 from tsgt.simulation.mission.stream_listener import listen_to_stream
 
 __all__ = [

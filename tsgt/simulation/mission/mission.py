@@ -20,6 +20,7 @@ from tsgt.config import SuperframeMasterConfig, level_frame, scenario_parameters
 from tsgt.estimation import start_now
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
+from tsgt.radio.superframe.wire import KEY_BYTES
 from tsgt.recording import decode
 from tsgt.simulation.imu import IMU_MODELS, ImuProgram, simulate_imu
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
@@ -38,15 +39,11 @@ from tsgt.simulation.mission.daemon_configs import (
     station_name,
 )
 from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
-from tsgt.simulation.mission.poll_replies import observed
-from tsgt.simulation.mission.run_log import (
-    START_UNIX_NS,
-    MasterLog,
-    ObservedInstrument,
-    StationLog,
-    StationMove,
-)
+from tsgt.simulation.mission.master_log import MasterLog
+from tsgt.simulation.mission.observed import ObservedInstrument, observed_radio
+from tsgt.simulation.mission.result import START_UNIX_NS, StationMove
 from tsgt.simulation.mission.setup_mistakes import NO_MISTAKE, SetupMistake
+from tsgt.simulation.mission.station_log import StationLog
 from tsgt.simulation.wheel_odometry import OdometryModel, OdometryProgram, simulate_odometry
 from tsgt.simulation.world import is_shaken, scenario_world
 from tsgt.station import ClientDependencies, ClientStatus, run_client
@@ -75,7 +72,6 @@ INTERFERER = "foreign"
 
 _OUTAGE_DB = 300.0
 _INTERFERER_POSITION_M = (30.0, -20.0, 1.5)
-_KEY_BYTES = 32
 _SHAKING_SEED = 0x5A
 _YEAR_NS = 365 * 86_400 * 10**9
 
@@ -117,7 +113,7 @@ class Mission:
         names = [MASTER, *map(station_name, numbers)]
         rngs = dict(zip(names, [master_rng, *station_rngs], strict=True))
         authenticated = options.authenticated and isinstance(options.protocol, SuperframeMasterConfig)
-        self._key = key_rng.bytes(_KEY_BYTES) if authenticated else None
+        self._key = key_rng.bytes(KEY_BYTES) if authenticated else None
         self.parameters = scenario_parameters(scenario)
         until_s = options.duration_s + 2 * DRAIN_S
         self.world: World = scenario_world(scenario, until_s, world_rng)  # ground truth on true time
@@ -314,7 +310,9 @@ class Mission:
         writer = computer.new_writer()
         open_radio = computer.radio(settings)
         if not self.superframe:
-            open_radio = observed(open_radio, lambda reply: master_log.observe_reply(reply, clock.true_ns))
+            open_radio = observed_radio(
+                open_radio, lambda reply: master_log.observe_reply(reply, clock.true_ns)
+            )
         return run_master(
             config,
             parameters,

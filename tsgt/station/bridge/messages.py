@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from tsgt.model import MAX_INSTANT_NS, MAX_NUMBER, Status
+from tsgt.model import MAX_INSTANT_NS, MAX_NUMBER, FiniteNumbers, Status
 from tsgt.radio import Direction  # noqa: TC001 (pydantic resolves annotations at run time)
 from tsgt.recording import Typed, decode
 
@@ -53,10 +53,8 @@ class HelloLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Measurement:
+class _Measurement(FiniteNumbers):
     """Fields of both; angles 0 to 2 pi, distance positive, ``host_time_ns`` on CLOCK_MONOTONIC; null where unknown."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     horizontal_angle_rad: float | None = None
     zenith_angle_rad: float | None = None
@@ -116,10 +114,8 @@ class StatusLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SettingsLine:
+class SettingsLine(FiniteNumbers):
     """The instrument's settings; see :class:`~tsgt.recording.journal.InstrumentRecord`."""
-
-    __pydantic_config__: ClassVar[dict[str, bool]] = {"allow_inf_nan": False}
 
     type: Literal["settings"] = "settings"
     prism_type: str = ""
@@ -205,7 +201,8 @@ def decode_program_line(data: bytes) -> ProgramLine | None:
     kind = decode(Typed, data).type
     if kind == "hello" and (version := decode(_Versioned, data).bridge) != FORMAT_VERSION:
         raise BridgeVersionError(
-            f"uses version {version} of the bridge's lines, and this client version {FORMAT_VERSION}"
+            f"prints version {version} of the bridge's line format; this client supports version {FORMAT_VERSION}: update the "
+            "older of the two"
         )
     return decode(_KINDS[kind], data) if kind in _KINDS else None
 

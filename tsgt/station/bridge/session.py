@@ -170,7 +170,7 @@ class BridgeSession:
         try:
             return decode_program_line(line)
         except BridgeVersionError as error:
-            self.fail(f"the program {error}; use one for this version")
+            self.fail(f"the program {error}")
         except ValueError as error:
             self._rejected.add(str(error), line)
             if self._pending is not None and response_id(line) == self._pending[0]:

@@ -73,7 +73,7 @@ def decode_full_measurement(reply: Reply) -> FullMeasurement:
     status = STATUS.get(outcome_of(code, has_values=bool(reply.values)), Status.ERROR)
     horizontal_rad = zenith_rad = 0.0
     distance_m = time_ms = None
-    if status.usable or status is Status.ANGLE_ONLY or status is Status.NO_TARGET:
+    if status.has_target or status is Status.NO_TARGET:
         angles = numeric_values(reply, 2)
         if angles is not None and not (abs(angles[0]) <= 2 * math.tau and 0 <= angles[1] <= math.tau):
             angles = None  # damaged on the line

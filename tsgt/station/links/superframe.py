@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import structlog
 
-from tsgt.radio.superframe import SendQueue, SuperframeStation
+from tsgt.radio.superframe import COMPOSE_LEAD_NS, SendQueue, SuperframeStation
 from tsgt.radio.superframe.wire import Authenticator, angle_code
 from tsgt.recording.journal import AcknowledgedRecord, ReceptionRecord
 from tsgt.service import LogLimiter
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from tsgt.recording.journal import TargetRecord
     from tsgt.station.backlog import Backlog
     from tsgt.station.dependencies import ClientDependencies
-
-REPLY_LEAD_NS = 6_000_000
-"""A reply is composed this long before its slot: the radio needs 3 ms, a Raspberry Pi the rest."""
 
 NO_SLOT_TIMEOUT_NS = 30_000_000_000
 """A station that the master has not received lately has a slot in each fourth frame only, of at most 3 s with 16 stations."""
@@ -151,7 +148,7 @@ class SuperframeLink:
 
     async def _reply(self, radio: Radio, slot_ns: int) -> None:
         missed_slots = self._station.missed_slots
-        await self._clock.sleep_until(slot_ns - REPLY_LEAD_NS)
+        await self._clock.sleep_until(slot_ns - COMPOSE_LEAD_NS)
         self._watch.check()
         reply = self._station.compose(self._instrument_state(), self._clock.monotonic_ns())
         # A late reply would collide with the next slot. To the station it is one that was lost on the air.

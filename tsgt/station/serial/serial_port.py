@@ -7,7 +7,6 @@ import errno
 import fcntl
 import os
 import termios
-from collections import deque
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -19,6 +18,7 @@ import structlog
 
 from tsgt.errors import InstrumentError
 from tsgt.station.serial.base import Chunk
+from tsgt.station.serial.chunk_queue import ChunkQueue
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
@@ -95,9 +95,7 @@ class _SerialPort(asyncio.Protocol):
         self._closed: asyncio.Future[None] = loop.create_future()
         self._clock = clock
         self._transport: Any = None
-        self._chunks: deque[Chunk] = deque(maxlen=_KEPT_CHUNKS)
-        self._waiter: asyncio.Future[None] | None = None
-        self._error = ""
+        self._received = ChunkQueue(_KEPT_CHUNKS)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = transport
@@ -105,57 +103,38 @@ class _SerialPort(asyncio.Protocol):
             self.opened.set_result(None)
 
     def data_received(self, data: bytes) -> None:
-        self._chunks.append(Chunk(data, self._clock.monotonic_ns()))
-        self._wake()
+        self._received.put(Chunk(data, self._clock.monotonic_ns()))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._error = self._error or _lost_message(self.name, exc)
+        self._received.fail(_lost_message(self.name, exc))
         self._closed.set_result(None)
-        self._wake()
 
     def write(self, data: bytes) -> None:
-        self._check()
+        self._received.check()
         try:
             # Not by the transport: it would log a traceback when the cable has just been unplugged.
             os.write(self._transport.serial.fileno(), data)
         except BlockingIOError:
             pass  # the output buffer is full; the missing reply reveals the lost request
         except _FAILURES as error:
-            self._error = _lost_message(self.name, error)
-            raise InstrumentError(self._error) from error
+            message = _lost_message(self.name, error)
+            self._received.fail(message)
+            raise InstrumentError(message) from error
 
     async def read(self) -> Chunk:
-        while not self._chunks:
-            self._check()
-            self._waiter = asyncio.get_running_loop().create_future()
-            try:
-                await self._waiter
-            finally:
-                self._waiter = None
-        return self._chunks.popleft()
+        return await self._received.read()
 
     def drain(self) -> bytes:
-        self._check()
-        data = b"".join(chunk.data for chunk in self._chunks)
-        self._chunks.clear()
-        return data
+        return self._received.drain()
 
     async def close(self) -> None:
-        self._error = self._error or f"{self.name}: closed"
+        self._received.fail(f"{self.name}: closed")
         if not self._transport.is_closing():
             with suppress(*_FAILURES):
                 # Closing would otherwise block until the kernel has sent its buffer.
                 self._transport.serial.reset_output_buffer()
             self._transport.abort()
         await asyncio.shield(self._closed)
-
-    def _check(self) -> None:
-        if self._error:
-            raise InstrumentError(self._error)
-
-    def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
 
 
 def _lost_message(name: str, error: Exception | None) -> str:

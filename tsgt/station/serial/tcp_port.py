@@ -12,12 +12,12 @@ import ipaddress
 import socket
 import struct
 import threading
-from collections import deque
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from tsgt.errors import InstrumentError
 from tsgt.station.serial.base import Chunk
+from tsgt.station.serial.chunk_queue import ChunkQueue
 
 if TYPE_CHECKING:
     from tsgt.clock import Clock
@@ -97,11 +97,9 @@ class _TcpPort(asyncio.Protocol):
         self._clock = clock
         self._transport: Any = None
         self._closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._chunks: deque[Chunk] = deque()
+        self._received = ChunkQueue()
         self._kept = 0
-        self._received = False
-        self._waiter: asyncio.Future[None] | None = None
-        self._error = ""
+        self._has_received = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = transport
@@ -119,44 +117,33 @@ class _TcpPort(asyncio.Protocol):
         link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
     def data_received(self, data: bytes) -> None:
-        self._received = True
-        self._chunks.append(Chunk(data, self._clock.monotonic_ns()))
+        self._has_received = True
+        self._received.put(Chunk(data, self._clock.monotonic_ns()))
         self._kept += len(data)
         if self._kept > _KEPT_BYTES:
             self._transport.pause_reading()
-        self._wake()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._error = self._error or self._lost_message(exc)
+        self._received.fail(self._lost_message(exc))
         if not self._closed.done():
             self._closed.set_result(None)
-        self._wake()
 
     def write(self, data: bytes) -> None:
-        self._check()
+        self._received.check()
         self._transport.write(data)
 
     async def read(self) -> Chunk:
-        while not self._chunks:
-            self._check()
-            self._waiter = asyncio.get_running_loop().create_future()
-            try:
-                await self._waiter
-            finally:
-                self._waiter = None
-        chunk = self._chunks.popleft()
+        chunk = await self._received.read()
         self._taken(len(chunk.data))
         return chunk
 
     def drain(self) -> bytes:
-        self._check()
-        data = b"".join(chunk.data for chunk in self._chunks)
-        self._chunks.clear()
+        data = self._received.drain()
         self._taken(len(data))
         return data
 
     async def close(self) -> None:
-        self._error = self._error or f"{self.name}: closed"
+        self._received.fail(f"{self.name}: closed")
         self._transport.abort()
         await asyncio.shield(self._closed)
 
@@ -166,16 +153,8 @@ class _TcpPort(asyncio.Protocol):
             self._transport.resume_reading()
 
     def _lost_message(self, error: Exception | None) -> str:
-        if not self._received:
+        if not self._has_received:
             return f"{self.name}: the connection was closed at once; another program may be connected, an instrument takes one"
         if error is None:
             return f"{self.name}: the instrument has closed the connection"
         return f"{self.name}: the connection is lost ({getattr(error, 'strerror', None) or error})"
-
-    def _check(self) -> None:
-        if self._error:
-            raise InstrumentError(self._error)
-
-    def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)

@@ -112,24 +112,3 @@ class Share:
             self._seconds.popleft()
         poses = sum(each[1] for each in self._seconds)
         return sum(each[2] for each in self._seconds) / poses if poses else None
-
-
-class DelayEstimate:
-    """Delay of lines beyond the least one since the connection was made.
-
-    The clocks of two computers differ by an unknown offset, and in their rates by less than :data:`_SKEW`.
-    """
-
-    _SKEW = 1e-4
-
-    def __init__(self) -> None:
-        self._least_s = math.inf
-        self._at_s = 0.0
-        self.delay_s = 0.0
-
-    def arrived(self, stamp_s: float, now_s: float) -> None:
-        """Take the stamp of a line that was made at once, and when it arrived."""
-        difference_s = now_s - stamp_s
-        self._least_s = min(self._least_s + self._SKEW * (now_s - self._at_s), difference_s)
-        self._at_s = now_s
-        self.delay_s = difference_s - self._least_s

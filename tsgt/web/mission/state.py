@@ -10,6 +10,7 @@ import re
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from tsgt.client.delay import LeastDelay
 from tsgt.model import PolarMeasurement
 from tsgt.recording import (
     PROTOCOL_VERSION,
@@ -24,7 +25,7 @@ from tsgt.recording import (
 from tsgt.web.frames import add, inverse, product, rotate, subtract
 from tsgt.web.mission import findings, stations
 from tsgt.web.mission.figures import figures
-from tsgt.web.mission.history import EVENTS, DelayEstimate, History, Residuals, Share, Trail
+from tsgt.web.mission.history import EVENTS, History, Residuals, Share, Trail
 from tsgt.web.mission.stations import rounded
 from tsgt.web.mission.verdict import (
     POSE_AGE_LIMIT_S,
@@ -97,7 +98,8 @@ class MissionState:
     def _forget(self) -> None:
         """Forget what only holds of one connection; the histories stay."""
         self._line_s = -math.inf
-        self._delay = DelayEstimate()
+        self._least_delay = LeastDelay()
+        self._delay_s = 0.0
         self._setup: SetupRecord | None = None
         self._status: StatusRecord | None = None
         self._status_s = 0.0
@@ -208,7 +210,9 @@ class MissionState:
     def _take_status(self, data: bytes, now_s: float) -> None:
         self._status, self._status_s = decode(StatusRecord, data), now_s
         self._stamp_ns = self._status.stamp_ns
-        self._delay.arrived(self._status.stamp_ns / 1e9, now_s)
+        now_ns = round(now_s * 1e9)
+        self._least_delay.sample(self._stamp_ns, now_ns)
+        self._delay_s = (now_ns - self._least_delay.here_ns(self._stamp_ns)) / 1e9
 
     def _take_event(self, data: bytes, _now_s: float) -> None:
         event = decode(EventRecord, data)
@@ -313,7 +317,7 @@ class MissionState:
             connected=self._connected,
             problem=self._problem,
             silence_s=now_s - self._line_s,
-            delay_s=self._delay.delay_s,
+            delay_s=self._delay_s,
         )
 
     def _findings(self, now_s: float) -> list[Finding]:

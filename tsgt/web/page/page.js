@@ -244,7 +244,7 @@ function showStations(stations) {
       ["loss", station.loss === null || station.loss === undefined ? null : `${(100 * station.loss).toFixed(0)} %`],
       ["battery", given(station.battery_percent, "%")],
       ["heard", given(station.heard_s, "s ago", 1)],
-      ["air", given(station.air_ppm, "ppm", 1)],
+      ["atm.", given(station.air_ppm, "ppm", 1)],
       ["checked", station.check_s === null || station.check_s === undefined ? null : `${minutesAndHours(station.check_s)} ago`],
     ].filter(([, value]) => value !== null);
     rows(tile.querySelector("dl"), facts);

@@ -8,12 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from tsgt.analysis.compare import Estimate, ReferencePoses
-from tsgt.analysis.compare.checks import input_findings, quaternion_finding, relative_offset_s
-from tsgt.config import ScenarioConfig
-from tsgt.model import ROBOT_ORIGIN
-from tsgt.simulation.estimates import (
+from harness.drives.estimates import (
     GNSS,
     LIDAR,
     VISUAL_INERTIAL,
@@ -21,6 +16,11 @@ from tsgt.simulation.estimates import (
     draw_relation,
     simulate_estimate,
 )
+
+from tsgt.analysis.compare import Estimate, ReferencePoses
+from tsgt.analysis.compare.checks import input_findings, quaternion_finding, relative_offset_s
+from tsgt.config import ScenarioConfig
+from tsgt.model import ROBOT_ORIGIN
 from tsgt.simulation.world import World, scenario_world
 
 START_NS = 1_700_000_000_000_000_000

@@ -112,7 +112,7 @@ def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
 
 @pytest.mark.parametrize(
     ("after_mm", "code", "said"),
-    [([6.0], 3, "check failed: the held-out prediction error has grown"), ([], 0, "was not judged")],
+    [([6.0], 3, "check failed: the held-out prediction error is larger"), ([], 0, "was not validated")],
 )
 def test_held_out_error_is_judged_or_the_command_says_so(
     tsgt: Tsgt,

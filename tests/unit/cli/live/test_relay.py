@@ -51,7 +51,7 @@ def test_certificate_needs_its_private_key(tsgt: Tsgt, tmp_path: Path) -> None:
     tsgt("relay", "--make-key", tmp_path / "k")
     outcome = tsgt("relay", "--key", tmp_path / "k", "--certificate", tmp_path / "k")
     assert outcome.code == 2
-    assert "given together" in outcome.err
+    assert "give --certificate and --private-key together" in outcome.err
     outcome = tsgt(
         "relay", "--key", tmp_path / "k", "--certificate", tmp_path / "k", "--private-key", tmp_path / "k"
     )

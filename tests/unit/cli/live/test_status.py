@@ -177,7 +177,7 @@ def test_sound_wheels_are_shown_with_scale_and_slip() -> None:
     assert well
     assert lines[-9:] == [
         "",
-        click.style("WHEELS  OK", bold=True, reverse=False),
+        click.style("ODOMETRY  OK", bold=True, reverse=False),
         "  Acme base",
         "  20.0 Hz  last 0.1 s",
         "  1 gaps, 2 samples lost",
@@ -194,7 +194,7 @@ def test_sound_wheels_are_shown_with_scale_and_slip() -> None:
         ({"age_s": None}, "NO SAMPLES YET", False),
         ({"age_s": 3.0}, "SILENT 3.0 s", False),
         ({"problem": "the encoder is not connected"}, "the encoder is not connected", False),
-        ({"use": "disagrees"}, "DISAGREE WITH IMU AND PRISMS", False),
+        ({"use": "disagrees"}, "DISAGREES WITH IMU AND PRISMS", False),
         ({"use": "without_imu"}, "NOT IN USE: NO IMU", True),
     ],
 )
@@ -212,7 +212,7 @@ def test_problem_of_the_wheels_is_shown(change: dict[str, object], word: str, *,
         ({"last_heard_s": None, "answering": None}, "NOT RECEIVED YET"),
         ({"last_heard_s": 12.0, "answering": False}, "SILENT 12 s"),
         ({"status": None, "age_s": None}, "NO MEASUREMENT YET"),
-        ({"age_s": 5.0}, "OLD 5.0 s"),
+        ({"age_s": 5.0}, "NO MEASUREMENT FOR 5.0 s"),
         ({"status": Status.TILT}, "NOT LEVEL"),
         ({"status": Status.NO_TARGET}, "NO PRISM"),
         ({"status": Status.WRONG_DISTANCE}, "WRONG TARGET"),
@@ -273,7 +273,7 @@ def test_client_reports_why_no_master_is_received(change: dict[str, object], wor
 def test_client_text_has_instrument_settings_and_activity() -> None:
     """Battery, prism constant, atmospheric correction, and unusual activity."""
     text = "\n".join(client_text(CLIENT)[0])
-    for part in ("battery 57 %", "prism mini_360 +30.0 mm", "air +8.1 ppm: 20.0 C, 1013.2 hPa"):
+    for part in ("battery 57 %", "prism mini_360 +30.0 mm", "atm. +8.1 ppm: 20.0 C, 1013.2 hPa"):
         assert part in text
     looking = dataclasses.replace(CLIENT, activity="looking for the prism around its last direction")
     assert "  looking for the prism around its last" in client_text(looking)[0]

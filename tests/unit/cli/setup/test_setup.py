@@ -218,10 +218,10 @@ def test_user_without_root_is_told_to_use_sudo(tsgt: Tsgt, pi: PiToSetUp) -> Non
 
 
 def test_damaged_mission_text_is_rejected(tsgt: Tsgt, pi: PiToSetUp) -> None:
-    """By its check sum, before any key is written."""
+    """By its checksum, before any key is written."""
     damaged = MISSION.replace("/9/", "/8/", 1)
     done = tsgt("setup", "station", "--yes", "--station", 1, "--prism-type", "360", "--mission", damaged)
-    assert "check sum" in failed(done)
+    assert "checksum" in failed(done)
     assert not (pi.root / "etc/tsgt/radio.key").exists()
 
 

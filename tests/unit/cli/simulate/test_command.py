@@ -13,7 +13,7 @@ from tsgt.cli.simulate import command
 from tsgt.config import ScenarioConfig
 from tsgt.recording import load_recording
 from tsgt.simulation.checks import Violation
-from tsgt.simulation.mission.run_log import START_UNIX_NS
+from tsgt.simulation.mission.result import START_UNIX_NS
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from harness.inertial.imu_calibration import in_calibrated_axes
 
 from tsgt.geometry import exp_so3
 from tsgt.geometry.inertial import Mounting
-from tsgt.geometry.inertial_calibration import ImuSetup, in_calibrated_axes
+from tsgt.geometry.inertial_calibration import ImuSetup
 from tsgt.geometry.inertial_calibration.setup import accelerometer_directions, gyro_directions, gyro_rotation
 
 if TYPE_CHECKING:

@@ -135,7 +135,7 @@ async def test_frame_without_replies_ends_with_its_last_slot() -> None:
             await asyncio.sleep(2)
     assert call_log.calls[:6] == ["composing", "beacon", "not received [1, 2]"] * 2
     slots_ns = 2 * (TIMING.airtime_ns(44) + TIMING.guard_ns) + TIMING.turnaround_ns
-    session_bytes = 25  # of a beacon with session item
+    session_bytes = 25  # of a beacon with a session item
     first_ns = call_log.sent_ns[1] - call_log.sent_ns[0] - TIMING.airtime_ns(session_bytes)
     assert first_ns == pytest.approx(slots_ns, abs=8 * MS)
 

@@ -242,7 +242,7 @@ def test_replayed_session_is_never_confirmed() -> None:
         joined.append(member.core.joined)
         assert len(member.send_queue) >= before
         assert member.core.next_command() is None
-    assert not any(joined[40:])  # from the first beacon with session info on
+    assert not any(joined[40:])  # from the first beacon with a session item on
     loop.run_frame()
     assert 2 in loop.received_replies
     assert member.core.joined

@@ -48,7 +48,7 @@ def frames() -> ScriptedFrames:
 
 
 def sessions(frames: ScriptedFrames, count: int, silent: tuple[int, ...] = ()) -> list[int]:
-    """Run frames; return the counters of those with session info."""
+    """Run frames; return the counters of those with a session item."""
     found = []
     for _ in range(count):
         frames.run(1, silent)
@@ -58,7 +58,7 @@ def sessions(frames: ScriptedFrames, count: int, silent: tuple[int, ...] = ()) -
 
 
 def test_beacon_of_another_master_is_counted(frames: ScriptedFrames) -> None:
-    """One with session info and the right key; not the own ones, a forged one, or noise."""
+    """One with a session item and the right key; not the own ones, a forged one, or noise."""
     other = scripted_frames()
     other.master.session = 7
     other.begin()
@@ -72,7 +72,7 @@ def test_beacon_of_another_master_is_counted(frames: ScriptedFrames) -> None:
 
 
 def test_first_beacon_invites_stations() -> None:
-    """It has session info and slots for join requests, and no time of a previous beacon."""
+    """It has a session item and slots for join requests, and no time of a previous beacon."""
     frames = scripted_frames()
     beacon = frames.begin()
     assert beacon.session == SessionInfo(
@@ -88,7 +88,7 @@ def test_first_beacon_invites_stations() -> None:
 
 
 def test_beacon_carries_time_of_previous_beacon(frames: ScriptedFrames) -> None:
-    """In full with session info, otherwise its low bits; low bits 0 are sent as 1."""
+    """In full with a session item, otherwise its low bits; low bits 0 are sent as 1."""
     frames.run(30)
     for _ in range(8):
         sent_us = frames.sent_us

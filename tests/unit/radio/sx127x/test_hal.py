@@ -13,8 +13,10 @@ import pytest
 from harness.hardware.pi import LINE, FakePi, FakeRpiGpio
 from harness.hardware.radios import PAPER, make_side, running_timeline
 
+from tsgt.config import WiringConfig
 from tsgt.errors import RadioError, RadioNotFoundError, RadioSettingsError
-from tsgt.radio.sx127x import DRAGINO_HAT, Edge, SX127x, Wiring, hal, open_hal
+from tsgt.radio.from_config import wiring
+from tsgt.radio.sx127x import Edge, SX127x, Wiring, hal, open_hal
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.simulation.lora import Air, LinkModel
 
@@ -46,9 +48,9 @@ def rpi_gpio() -> FakeRpiGpio:
     return gpio
 
 
-def test_dragino_preset_is_the_hat() -> None:
-    """The preset has the pins of the HAT's manual, chip select as GPIO, and kernel timestamps."""
-    assert hat() == DRAGINO_HAT
+def test_default_wiring_is_the_hat() -> None:
+    """The pins of the HAT's manual, chip select as GPIO, and kernel timestamps."""
+    assert wiring(WiringConfig()) == hat()
 
 
 def test_spi_clock_above_the_data_sheet_is_rejected() -> None:
@@ -57,7 +59,7 @@ def test_spi_clock_above_the_data_sheet_is_rejected() -> None:
         hat(spi_hz=10_000_001)
 
 
-# --- What both back ends do ---------------------------------------------------------------------------------------
+# --- What both backends do ----------------------------------------------------------------------------------------
 
 
 @BACKENDS

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tsgt.simulation.checks.imu_samples import imu_status_failures
-from tsgt.simulation.mission.run_log import PublishedCounts
+from tsgt.simulation.mission.master_log import PublishedCounts
 
 STATUSES = 12
 

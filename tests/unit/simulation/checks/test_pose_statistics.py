@@ -15,7 +15,7 @@ from tsgt.simulation.checks.poses.covariance_scale import mean_of_correlated, sc
 from tsgt.simulation.checks.poses.lateness import lateness_failures
 from tsgt.simulation.checks.poses.rules import rule_failures
 from tsgt.simulation.checks.poses.twists import twist_failures
-from tsgt.simulation.mission.run_log import ValidPoses
+from tsgt.simulation.mission.master_log import ValidPoses
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -34,7 +34,7 @@ from tsgt.simulation.checks.recorded_lines import recording_failures, size_failu
 from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.mission import MasterLog
-from tsgt.simulation.mission.poll_replies import PollReply
+from tsgt.simulation.mission.observed import PollReply
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -117,8 +117,8 @@ def test_status_with_a_wrong_size_of_the_recording(
 def test_lines_that_a_reader_got(tmp_path: Path, heard: list[int], count: int) -> None:
     """Line 0 is a greeting, 3 the set-up, 4 to 6 follow, 9 is unknown."""
     log = _log(tmp_path)
-    log.line_hashes, log.heard, log.setup_hashes = array("q", [3, 4, 5, 6]), [array("q", heard)], {3}
-    assert len(list(heard_failures(log))) == count
+    log.line_hashes, log.setup_hashes = array("q", [3, 4, 5, 6]), {3}
+    assert len(list(heard_failures(log, [heard]))) == count
 
 
 def _status(**changes: Any) -> StatusRecord:

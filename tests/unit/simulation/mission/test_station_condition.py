@@ -41,7 +41,7 @@ def test_condition_reaches_status_event_terminal_and_page(tmp_path: Path) -> Non
     text, ok = master_text(status)
     assert all(
         any(words in line for line in text)
-        for words in ("battery 12 %", "change its battery", "air +41.5 ppm")
+        for words in ("battery 12 %", "change its battery", "atm. +41.5 ppm")
     )
     assert not ok
 

@@ -297,7 +297,7 @@ async def test_other_version_is_rejected() -> None:
     start = FakeStart(CLOCK, {"type": "hello", "bridge": 2})
     instrument = BridgeInstrument(CONFIG, CLOCK, start)
     with pytest.raises(
-        InstrumentError, match=r"uses version 2 of the bridge's lines, and this client version 1"
+        InstrumentError, match=r"prints version 2 of the bridge's line format; this client supports version 1"
     ):
         await instrument.connect()
     assert start.programs[0].ended

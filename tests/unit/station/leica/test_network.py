@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pytest
 from harness.instruments.leica import LeicaBench, leica_bench, leica_config
+from harness.instruments.network_line import PeerKind, SimulatedNetwork
 from structlog.testing import capture_logs
 
 from tsgt.config import TcpAddress
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
-from tsgt.simulation.instrument import PeerKind, SimulatedNetwork
 from tsgt.simulation.instrument.geocom import ForcedResponse
 from tsgt.station.geocom import ReturnCode, Rpc
 from tsgt.station.leica import LeicaInstrument

@@ -1,4 +1,4 @@
-"""What stands between an estimate and the reference, fitted jointly: clock, scale, extrinsic and frame, each with its uncertainty.
+"""The relation between an estimate and the reference, fitted jointly: clock, scale, extrinsic and frame, each with its uncertainty.
 
 In: paired poses with the reference's covariance, and what is to be fitted. Out: ``Fit``. `initialisation` begins without a first guess;
 `joint_fit` iterates over the equations of `drifting_frame` with error levels of `noise` and `reference_error`; `frame` places the frame

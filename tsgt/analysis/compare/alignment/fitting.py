@@ -1,4 +1,4 @@
-"""The fit of what stands between an estimate and the reference, with uncertainties that allow for drift."""
+"""The fit of the relation between an estimate and the reference, with uncertainties that allow for drift."""
 
 from __future__ import annotations
 

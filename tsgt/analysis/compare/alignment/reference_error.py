@@ -64,7 +64,7 @@ def change_variance(lag_s: float) -> float:
 
 
 def as_white(covariance: FloatArray, step_s: float) -> FloatArray:
-    """Return the covariance of white noise at these steps with the power of the correlated errors where robots move."""
+    """Return the covariance, (N, 6, 6), of white noise at these steps, in s, with the power of the correlated errors where robots move."""
     return covariance * max(1.0, WHITE_EQUIVALENT_S / step_s)
 
 

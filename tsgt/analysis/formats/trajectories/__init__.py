@@ -4,7 +4,6 @@ Comes in: files. Goes out: estimates and reference poses of :mod:`tsgt.analysis.
 that cannot be used raises one line.
 """
 
-from tsgt.analysis.formats.trajectories.columns import TextFormat
 from tsgt.analysis.formats.trajectories.estimates import read_estimates
 from tsgt.analysis.formats.trajectories.reference_files import (
     is_measured,
@@ -14,7 +13,6 @@ from tsgt.analysis.formats.trajectories.reference_files import (
 )
 
 __all__ = [
-    "TextFormat",
     "is_measured",
     "is_recording",
     "read_estimates",

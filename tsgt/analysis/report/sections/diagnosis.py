@@ -53,7 +53,7 @@ def diagnosis_section(
         tables.append(Table(caption, ("station", "distance", "horizontal angle", "zenith angle"), rows))
     if diagnosis.held_out:
         rows = tuple((part.name, str(part.n), format_number(part.ratio, 2)) for part in diagnosis.held_out)
-        caption = "Mean prediction error of left-out measurements by the estimator continuous, relative to linear (below 1: better)"
+        caption = "Mean prediction error of held-out measurements by the estimator continuous, relative to linear (below 1: better)"
         tables.append(Table(caption, ("part of the drive", "measurements", "ratio"), rows))
     if refined:
         caption = (

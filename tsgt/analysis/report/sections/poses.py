@@ -41,8 +41,8 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
     tables, plots = [], []
     if f.held_out is not None:
         text.append(
-            "Each measurement in turn was left out and predicted from all others, by each estimator. The difference between "
-            "prediction and measurement contains the noise of the measurement."
+            "Measurements were held out in folds, of one prism at a time, and predicted from the remaining ones by each estimator. "
+            "The difference between prediction and measurement contains the noise of the measurement."
         )
         rows = [
             format_cells(label, (m.n, 0), (m.mean, 1), (m.median, 1), (m.p95, 1))
@@ -56,7 +56,7 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         header = ("estimator", "measurements", "mean", "median", "95 %")
         tables.append(
             Table(
-                "Error of the predicted positions of prisms, of measurements that were left out (mm)",
+                "Held-out prediction error of prism positions (mm)",
                 header,
                 tuple(rows),
             )
@@ -66,8 +66,8 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
         plots.append(
             ReportFigure(
                 "held_out",
-                "Prediction error of left-out measurements",
-                "Share of the left-out measurements that are predicted better than the error on the axis: a curve further up "
+                "Prediction error of held-out measurements",
+                "Share of the held-out measurements that are predicted better than the error on the axis: a curve further up "
                 "and left is better.",
                 65.0,
                 lambda figure: draw.draw_held_out(figure, held_out),
@@ -76,7 +76,7 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
     else:
         why = f.problems.get("held_out")
         text.append(
-            f"How well left-out measurements are predicted was not computed{f': {why}' if why else ''}; `--held-out` does it, "
+            f"How well held-out measurements are predicted was not computed{f': {why}' if why else ''}; `--held-out` does it, "
             "and takes several times as long."
         )
     if f.poses_by_estimator:
@@ -102,7 +102,7 @@ def estimator_section(f: Findings, axis: TimeAxis) -> Section:
             )
         )
     return Section(
-        "Both estimators, and prediction of left-out measurements", tuple(text), tuple(tables), tuple(plots)
+        "Both estimators, and prediction of held-out measurements", tuple(text), tuple(tables), tuple(plots)
     )
 
 

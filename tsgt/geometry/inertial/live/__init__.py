@@ -9,12 +9,10 @@ samples end; `known_rotation` carries a rotation over a loss.
 from tsgt.geometry.inertial.live.fixed_lag import InertialFixedLagSmoother
 from tsgt.geometry.inertial.live.health import DISAGREES_WITH_PRISMS, usable_samples
 from tsgt.geometry.inertial.live.saturation import SaturationMonitor
-from tsgt.geometry.inertial.live.window_trajectory import WindowTrajectory
 
 __all__ = [
     "DISAGREES_WITH_PRISMS",
     "InertialFixedLagSmoother",
     "SaturationMonitor",
-    "WindowTrajectory",
     "usable_samples",
 ]

@@ -21,8 +21,8 @@ from tsgt.geometry.inertial.live.known_rotation import KnownRotation
 from tsgt.geometry.inertial.live.prediction import StrapdownPredictor
 from tsgt.geometry.inertial.live.rate_prediction import RotationPredictor
 from tsgt.geometry.inertial.live.start_search import DIFFUSE_SIGMAS, StartSearch
-from tsgt.geometry.inertial.live.window import KnotWindow, SolvedWindow, divided, factorise, propagate
-from tsgt.geometry.inertial.live.window_trajectory import POSE_DIM, WindowTrajectory
+from tsgt.geometry.inertial.live.window import KnotWindow, SolvedWindow, divided, propagate
+from tsgt.geometry.inertial.live.window_trajectory import WindowTrajectory
 from tsgt.geometry.inertial.odometry import Odometry, WheelSamples, WheelsEstimate
 from tsgt.geometry.inertial.query import InertialTrajectory
 from tsgt.geometry.inertial.sensitivity import InertialSensitivity, Linearised, by_mounting, of_gyro_alone
@@ -33,6 +33,7 @@ from tsgt.geometry.inertial.solver import (
     InertialSolution,
     apply_linear_step,
     diffuse_inertial_prior,
+    factorise,
     solve_inertial,
 )
 from tsgt.geometry.inertial.states import INERTIAL_STATE_DIM, Gravity, Mounting
@@ -53,6 +54,7 @@ from tsgt.geometry.trajectory.measurement_window import (
     is_below_step_tolerance,
     normalised_innovations,
 )
+from tsgt.geometry.trajectory.states import POSE_DIM
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -22,7 +22,7 @@ from tsgt.geometry.rigid import IDENTITY, FloatArray, cross, matvec, skew
 from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
 from tsgt.geometry.trajectory.motion_prior import process_noise, transition
 from tsgt.geometry.trajectory.propagation import Propagator
-from tsgt.geometry.trajectory.states import STATE_DIM, States
+from tsgt.geometry.trajectory.states import POSE_DIM, STATE_DIM, States
 
 if TYPE_CHECKING:
     from tsgt.geometry.inertial.live.rate_prediction import PredictedRotation
@@ -42,8 +42,6 @@ SHAKING_TIME_S = 0.012
 instants: for a spectrum that is flat from 8 to 60 Hz.
 """
 PREDICTION_NOISE_SCALE = 2.0  # On the variances of the motion prior, as without an IMU
-
-_POSE_DIM = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,35 +129,41 @@ class StrapdownPredictor:
 
         ``samples``: those present, at least from the start on and at least one; ``odometry`` where the start has wheels.
         """
-        end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
-        link = self._at(end_s, samples, odometry)
-        onward_s = time_s - end_s
-        trend = _trend(samples) if onward_s > 0 else None
-        turning = self._turning(link.state, samples, onward_s)
-        state, by_error = self._reference_state(link.state, samples, trend, turning)
+        link, state, by_error, beyond = self._by_samples(time_s, samples, odometry)
         covariance = by_error @ link.covariance @ by_error.T
-        if trend is not None:
-            covariance += self._trend_noise(trend, onward_s, turning)
+        if beyond is not None:
+            covariance += self._noise_beyond(beyond)
             onward = Propagator(state, covariance, self._motion, process_noise_scale=PREDICTION_NOISE_SCALE)
-            return onward.at(time_s, dim=_POSE_DIM)
-        covariance = covariance[:_POSE_DIM, :_POSE_DIM]
+            return onward.at(time_s, dim=POSE_DIM)
+        covariance = covariance[:POSE_DIM, :POSE_DIM]
         return state, 0.5 * (covariance + covariance.T)[None]
 
     def by_start(
         self, time_s: float, samples: InertialSamples, odometry: Odometry | None = None
     ) -> FloatArray:
         """(6, D + S) Jacobian of the pose's error at a time by the error of the newest knot and of what all share."""
-        end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
-        link = self._at(end_s, samples, odometry)
-        onward_s = time_s - end_s
-        trend = _trend(samples) if onward_s > 0 else None
-        turning = self._turning(link.state, samples, onward_s)
-        state, by_error = self._reference_state(link.state, samples, trend, turning)
+        link, state, by_error, beyond = self._by_samples(time_s, samples, odometry)
         by_start: FloatArray = by_error @ link.by_start
-        if time_s > end_s:
+        if beyond is not None:
             onward = Propagator(state, np.zeros((STATE_DIM, STATE_DIM)), self._motion)
             by_start = onward.by_start(time_s) @ by_start
-        return by_start[:_POSE_DIM]
+        return by_start[:POSE_DIM]
+
+    def _by_samples(
+        self, time_s: float, samples: InertialSamples, odometry: Odometry | None
+    ) -> tuple[_Link, States, FloatArray, _Beyond | None]:
+        """Predict to a time or to the last sample before it; also for the reference point, with its Jacobian.
+
+        The last one: how it goes on from there; None: the samples reach the time.
+        """
+        end_s = min(max(float(samples.end_s[-1]), self.time_s), time_s)
+        link = self._at(end_s, samples, odometry)
+        beyond: _Beyond | None = None
+        if time_s > end_s:
+            onward_s = time_s - end_s
+            turning = self._rotation_predictor.predict(samples, link.state.gyro_bias[0], onward_s)
+            beyond = _Beyond(onward_s, _trend(samples), turning)
+        return link, *self._reference_state(link.state, samples, beyond), beyond
 
     def _at(self, end_s: float, samples: InertialSamples, odometry: Odometry | None) -> _Link:
         """Predict to a time up to the last sample, and keep states on the way."""
@@ -292,27 +296,16 @@ class StrapdownPredictor:
             noise,
         )
 
-    def _turning(
-        self, state: InertialStates, samples: InertialSamples, onward_s: float
-    ) -> PredictedRotation | None:
-        """Rotation beyond the last sample, if there are enough to predict it."""
-        if onward_s <= 0:
-            return None
-        return self._rotation_predictor.predict(samples, state.gyro_bias[0], onward_s)
-
     def _reference_state(
-        self,
-        state: InertialStates,
-        samples: InertialSamples,
-        trend: _Trend | None,
-        turning: PredictedRotation | None,
+        self, state: InertialStates, samples: InertialSamples, beyond: _Beyond | None
     ) -> tuple[States, FloatArray]:
         """State of the reference point, with rate and acceleration by the samples, and its Jacobian, (18, D + S).
 
-        ``trend``: to go on with it beyond the last sample, with the predicted rate if there is one.
+        ``beyond``: to go on with it beyond the last sample.
         """
-        if trend is not None:
-            rate, force = trend.rate, trend.force
+        turning: PredictedRotation | None = None
+        if beyond is not None:
+            rate, force, turning = beyond.trend.rate, beyond.trend.force, beyond.turning
         else:
             row = min(int(samples.end_s.searchsorted(state.time_s[0] - 1e-9)), len(samples) - 1)
             rate, force = samples.angular_rate_radps[row], samples.specific_force_mps2[row]
@@ -344,8 +337,9 @@ class StrapdownPredictor:
         )
         return found, by_error
 
-    def _trend_noise(self, trend: _Trend, onward_s: float, turning: PredictedRotation | None) -> FloatArray:
+    def _noise_beyond(self, beyond: _Beyond) -> FloatArray:
         """(18, 18) covariance of the motion that goes on beyond the last sample about that of the last samples."""
+        onward_s, trend, turning = beyond
         rate, force = trend.rate_sigma, trend.force_sigma
         angular = np.array(self._motion.angular_acceleration_sigma_radps2)
         linear = np.array(self._motion.acceleration_sigma_mps2)
@@ -375,6 +369,14 @@ class _Trend(NamedTuple):
     force: FloatArray  # (3,)
     rate_sigma: float
     force_sigma: float
+
+
+class _Beyond(NamedTuple):
+    """Motion beyond the last sample."""
+
+    onward_s: float  # From the last sample on, positive
+    trend: _Trend
+    turning: PredictedRotation | None  # If there are enough samples to predict the rotation
 
 
 def _trend(samples: InertialSamples) -> _Trend:

@@ -7,12 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.geometry.inertial.bordered import BorderedCholesky, factorise_bordered
-from tsgt.geometry.inertial.factors import (
-    InertialEquations,
-    InertialFactors,
-    assemble_inertial,
-)
+from tsgt.geometry.inertial.factors import InertialFactors, assemble_inertial
 from tsgt.geometry.inertial.query import strapdown
 from tsgt.geometry.inertial.solver import MAX_BIAS_ROTATION_RAD, MAX_KNOT_SPACING_S
 from tsgt.geometry.rigid import dot
@@ -22,6 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tsgt.geometry.inertial.anchor import InertialAnchor
+    from tsgt.geometry.inertial.bordered import BorderedCholesky
+    from tsgt.geometry.inertial.factors import InertialEquations
     from tsgt.geometry.inertial.odometry import Odometry
     from tsgt.geometry.inertial.preintegration import ContiguousSamples
     from tsgt.geometry.inertial.sensitivity import Linearised
@@ -141,11 +138,6 @@ def propagate(
     states.gyro_bias[row] = start.gyro_bias[0]
     if factors.odometry is not None:
         states.wheels[row] = factors.odometry.kept[row - 1] * start.wheels[0]
-
-
-def factorise(system: InertialEquations) -> BorderedCholesky:
-    """Factorise the normal equations of a window. Raises GeometryError: they are not positive definite."""
-    return factorise_bordered(system.diagonal, system.off_diagonal, system.border, system.corner)
 
 
 def divided(times_s: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.geometry.trajectory.states import States, concatenate_states
+from tsgt.geometry.trajectory.states import POSE_DIM, States, concatenate_states
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from tsgt.geometry.rigid import FloatArray
 
 UNKNOWN_SIGMA = 100.0  # Of positions in m and rotations in rad, of which nothing is known
-
-POSE_DIM = 6
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ OUTLIERS = Finding(
 
 def test_each_cause_has_a_row() -> None:
     """With size, effect, probability and what else it may be; what has no size is unknown."""
-    found = Diagnosis((TURNED, OUTLIERS), {2: (1.0, 3.04, 0.9)}, {}, {}, (Part("moving", 40, 0.553),))
+    found = Diagnosis((TURNED, OUTLIERS), {2: (1.0, 3.04, 0.9)}, (Part("moving", 40, 0.553),))
     causes, noise, held_out = diagnosis_section(found, None).tables
     assert causes.rows == (
         ("turned", "station 2", "0.31 ± 0.021 mrad", "14.2", "97.0%", "latency of station 2"),
@@ -47,5 +47,5 @@ def test_each_cause_has_a_row() -> None:
 
 def test_no_cause_is_said() -> None:
     """So is the reason why there is no diagnosis."""
-    assert "None was found." in diagnosis_section(Diagnosis((), {}, {}, {}), None).text[0]
+    assert "None was found." in diagnosis_section(Diagnosis((), {}), None).text[0]
     assert diagnosis_section(None, "too few measurements").text == ("Unknown: too few measurements.",)

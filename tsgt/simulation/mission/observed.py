@@ -1,4 +1,8 @@
-"""Observes the radio of a master with protocol classic: the measurements with which stations replied to its polls."""
+"""Observes daemons of a simulated mission at their hardware.
+
+Of a station's client the readings from its instrument; of a master with protocol classic the measurements with which
+stations replied to its polls.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,36 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.radio.classic import MEASUREMENT_BYTES, decode_command
+from tsgt.station.leica import LeicaInstrument
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable
 
+    from tsgt.clock import Clock
+    from tsgt.config import LeicaInstrumentConfig
     from tsgt.radio import LoRaSettings, Packet, Radio, RadioOpener, Transmission
+    from tsgt.station import Reading
+    from tsgt.station.serial import OpenPort
+
+
+class ObservedInstrument(LeicaInstrument):
+    """A Leica instrument that passes each reading of the tracked prism to a callback as well."""
+
+    def __init__(
+        self,
+        config: LeicaInstrumentConfig,
+        open_port: OpenPort,
+        clock: Clock,
+        on_reading: Callable[[Reading], None],
+    ) -> None:
+        super().__init__(config, open_port, clock)
+        self._on_reading = on_reading
+
+    async def read(self) -> Reading:
+        """Return the next measurement."""
+        reading = await super().read()
+        self._on_reading(reading)
+        return reading
 
 
 class PollReply(NamedTuple):
@@ -61,7 +90,7 @@ class ObservedRadio:
         await self._radio.close()
 
 
-def observed(open_radio: RadioOpener, on_reply: Callable[[PollReply], None]) -> RadioOpener:
+def observed_radio(open_radio: RadioOpener, on_reply: Callable[[PollReply], None]) -> RadioOpener:
     """Return an opener whose radios pass the replies to polls to a callback."""
 
     @asynccontextmanager

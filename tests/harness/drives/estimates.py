@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
 
 from tsgt.geometry import (
-    align,
     exp_so3,
     invert,
-    log_so3,
     quaternion_from_rotation,
     rotate,
     rotation_from_quaternion,
@@ -39,15 +37,11 @@ SECOND_NS = 1_000_000_000
 MIN_STAMP_STEP_NS = 1000
 """Stamps with jitter remain in order by at least this."""
 
+MAX_LEVER_ARM_M = 0.8
+"""Of the sensor from the robot's origin, along each axis."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Jump:
-    """A discontinuity of an estimate: relocalisation, loop closure, loss of the integer ambiguities."""
-
-    time_s: float
-    """In s from the start of the mission."""
-    position_m: tuple[float, float, float]
-    """Displacement along the axes of ``station1``."""
+MAX_DISTANCE_M = 50.0
+"""Of the frame of an estimate from ``station1``, along each axis."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +78,6 @@ class EstimateModel:
     diverges_at_s: float | None = None
     """From this time of the mission on, the position runs away with :attr:`divergence_mps2` in one horizontal direction."""
     divergence_mps2: float = 0.1
-    jumps: tuple[Jump, ...] = ()
 
 
 LIDAR = EstimateModel(
@@ -129,23 +122,14 @@ twice that, correlated by multipath over about a minute."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrueRelation:
-    """What stands between an estimate and the truth, as ``tsgt.analysis.compare.Relation`` defines it.
+    """The relation between an estimate and the truth, as ``tsgt.analysis.compare.Relation`` defines it.
 
-    The estimate at stamp τ is the pose of the sensor in ``frame``, its positions divided by ``scale``, at
-    ``t = τ + offset_s + skew (τ - τ_0)``.
+    The estimate at stamp τ is the pose of the sensor in ``frame`` at ``t = τ + offset_s``.
     """
 
     offset_s: float = 0.0
-    skew: float = 0.0
     T_robot_sensor: FloatArray
     T_station1_frame: FloatArray
-    scale: float = 1.0
-
-    def in_station1(self, T_frame_sensor: FloatArray) -> FloatArray:
-        """Return estimated poses in ``station1``, (M, 4, 4)."""
-        scaled = T_frame_sensor.copy()
-        scaled[:, :3, 3] *= self.scale
-        return self.T_station1_frame @ scaled
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,45 +144,22 @@ class SimulatedEstimate:
     T_station1_estimated: FloatArray  # (M, 4, 4) by the true relation; of positions alone, the true rotation
     T_station1_sensor: FloatArray  # (M, 4, 4) truth
 
-    def ate_position_m(self, align_by: Literal["none", "yaw", "rigid"] = "none") -> float:
-        """Root mean square of the true position error at the sensor, after least-squares alignment of the positions."""
-        true = self.T_station1_sensor[:, :3, 3]
-        aligned = _aligned(self.T_station1_estimated, true, align_by)
-        return _rms(aligned[:, :3, 3] - true)
-
-    def ate_rotation_rad(self, align_by: Literal["none", "yaw", "rigid"] = "none") -> float:
-        """Root mean square of the angle of the true rotation error, after alignment by the positions as above."""
-        true = self.T_station1_sensor
-        aligned = _aligned(self.T_station1_estimated, true[:, :3, 3], align_by)
-        return _rms(log_so3(np.swapaxes(true[:, :3, :3], 1, 2) @ aligned[:, :3, :3]))
-
 
 def draw_relation(
-    model: EstimateModel,
-    generator: np.random.Generator,
-    *,
-    max_offset_s: float = 2.0,
-    max_lever_arm_m: float = 0.8,
-    max_distance_m: float = 50.0,
-    scale: float = 1.0,
+    model: EstimateModel, generator: np.random.Generator, *, max_offset_s: float = 2.0
 ) -> TrueRelation:
-    """Draw offset, extrinsic and frame, each uniform; the sensor's axes point anywhere.
-
-    ``max_lever_arm_m``, ``max_distance_m``: of the sensor from the robot's origin and of the frame from that of ``station1``,
-    along each axis.
-    """
+    """Draw offset, extrinsic and frame, each uniform; the sensor's axes point anywhere."""
     yaw = exp_so3(np.array([0.0, 0.0, generator.uniform(-math.pi, math.pi)]))
     turned = _random_rotation(generator)
     return TrueRelation(
         offset_s=generator.uniform(-max_offset_s, max_offset_s),
         T_robot_sensor=transform_from(
             _random_rotation(generator) if model.orientation else np.eye(3),
-            generator.uniform(-max_lever_arm_m, max_lever_arm_m, 3),
+            generator.uniform(-MAX_LEVER_ARM_M, MAX_LEVER_ARM_M, 3),
         ),
         T_station1_frame=transform_from(
-            yaw if model.gravity_aligned else turned, generator.uniform(-max_distance_m, max_distance_m, 3)
+            yaw if model.gravity_aligned else turned, generator.uniform(-MAX_DISTANCE_M, MAX_DISTANCE_M, 3)
         ),
-        scale=scale,
     )
 
 
@@ -229,12 +190,12 @@ def simulate_estimate(
     kept = _kept(model, time_s, dropout_rng)
     kept[1:] &= np.diff(stamped_s) > MIN_STAMP_STEP_NS / SECOND_NS
     stamped_s, estimated = stamped_s[kept], estimated[kept]
-    elapsed_s = (stamped_s - stamped_s[0]) / (1.0 + truth.skew)
+    elapsed_s = stamped_s - stamped_s[0]
     in_frame = invert(truth.T_station1_frame) @ estimated
-    into = np.kron(np.diag([1.0 / truth.scale, 1.0]), truth.T_station1_frame[:3, :3].T)
+    into = np.kron(np.eye(2), truth.T_station1_frame[:3, :3].T)
     return SimulatedEstimate(
         start_ns + np.rint((stamped_s[0] - truth.offset_s + elapsed_s) * SECOND_NS).astype(np.int64),
-        in_frame[:, :3, 3] / truth.scale,
+        in_frame[:, :3, 3],
         quaternion_from_rotation(in_frame[:, :3, :3]) if model.orientation else None,
         into @ _covariance(model, time_s, sensor)[kept] @ into.T,
         truth,
@@ -262,8 +223,6 @@ def _with_errors(
     markov = _gauss_markov(model, stationary)
     position += walked[:, :3] + model.position_noise_m * whites[:, :3]
     position += markov[:, :3] * (model.horizontal_error_m, model.horizontal_error_m, model.vertical_error_m)
-    for jump in model.jumps:
-        position[time_s >= jump.time_s] += jump.position_m
     if model.diverges_at_s is not None:
         away = direction[0, :2] / np.linalg.norm(direction[0, :2])
         since_s = np.maximum(time_s - model.diverges_at_s, 0.0)
@@ -275,7 +234,7 @@ def _with_errors(
 
 
 def _covariance(model: EstimateModel, time_s: FloatArray, true: FloatArray) -> FloatArray:
-    """Covariance of the errors by the model, (N, 6, 6), without dropouts, divergence and jumps; stamps count by the mean velocity."""
+    """Covariance of the errors by the model, (N, 6, 6), without dropouts and divergence; stamps count by the mean velocity."""
     n = len(time_s)
     position = true[:, :3, 3]
     steps_m = np.diff(position, axis=0)
@@ -321,24 +280,6 @@ def _kept(model: EstimateModel, time_s: FloatArray, rng: np.random.Generator) ->
         kept &= (time_s < start_s) | (time_s > start_s + length_s)
     kept[0] = True
     return kept
-
-
-def _aligned(
-    estimated: FloatArray, true_m: FloatArray, align_by: Literal["none", "yaw", "rigid"]
-) -> FloatArray:
-    if align_by == "none":
-        return estimated
-    position = estimated[:, :3, 3]
-    if align_by == "rigid":
-        return align(position, true_m).T @ estimated
-    mean, true_mean = position.mean(axis=0), true_m.mean(axis=0)
-    (x, y, _), (u, v, _) = (position - mean).T, (true_m - true_mean).T
-    turn = exp_so3(np.array([0.0, 0.0, math.atan2(float(x @ v - y @ u), float(x @ u + y @ v))]))
-    return transform_from(turn, true_mean - turn @ mean) @ estimated
-
-
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
 def _random_rotation(generator: np.random.Generator) -> FloatArray:

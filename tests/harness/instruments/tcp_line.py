@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Self
 
-from tsgt.simulation.instrument.network_line import SimulatedNetwork
+from harness.instruments.network_line import SimulatedNetwork
+
 from tsgt.simulation.kernel import LoopTimeline
 
 if TYPE_CHECKING:
@@ -14,33 +15,30 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.clock import Clock
-    from tsgt.simulation.instrument.network_line import NetworkFaults
-    from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+    from tsgt.simulation.instrument import SimulatedTotalStation
     from tsgt.station.serial import Port
 
 
 class TcpLine:
     """A server on this computer, for one client at a time as at a real instrument; an async context manager.
 
-    ``port``: 0 for a free one, its number after entering. ``faults``: delays that are added in both directions.
+    ``port``: number of its port, after entering.
     """
 
-    def __init__(
-        self, instrument: SimulatedTotalStation, clock: Clock, rng: np.random.Generator, *, port: int = 0
-    ) -> None:
+    def __init__(self, instrument: SimulatedTotalStation, clock: Clock, rng: np.random.Generator) -> None:
         self._instrument = instrument
         self._clock = clock
         self._rng = rng
         self._server: asyncio.Server | None = None
         self._network: SimulatedNetwork | None = None
         self._connected: asyncio.StreamWriter | None = None
-        self.port = port
+        self.port = 0
 
     async def __aenter__(self) -> Self:
         """Listen."""
         timeline = LoopTimeline(asyncio.get_running_loop())
         self._network = SimulatedNetwork(self._instrument, timeline, self._clock, self._rng)
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
         self.port = self._server.sockets[0].getsockname()[1]
         return self
 
@@ -51,16 +49,10 @@ class TcpLine:
         traceback: TracebackType | None,
     ) -> None:
         """Close the server and the connection."""
-        assert self._server is not None  # noqa: S101 (entered)
+        assert self._server is not None  # entered
         self._server.close()
         self.drop()
         await self._server.wait_closed()
-
-    @property
-    def faults(self) -> NetworkFaults:
-        """Delays and faults."""
-        assert self._network is not None, "enter the line first"  # noqa: S101
-        return self._network.faults
 
     def drop(self) -> None:
         """Reset the connection."""
@@ -68,7 +60,7 @@ class TcpLine:
             self._connected.transport.abort()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        assert self._network is not None  # noqa: S101 (entered)
+        assert self._network is not None  # entered
         if self._connected is not None:  # a second client
             writer.close()
             return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from harness.files.records import POSE, START
 
-from tsgt.simulation.mission.run_log import MasterLog
+from tsgt.simulation.mission.master_log import MasterLog
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tsgt.clock import Clock
-    from tsgt.simulation.instrument.total_station import SimulatedTotalStation
+    from tsgt.simulation.instrument import SimulatedTotalStation
     from tsgt.simulation.kernel import Timeline
     from tsgt.station.serial import Port
 
 _CONNECT_TIMEOUT_NS = 5_000_000_000
 _PARETO_SHAPE = 1.5  # of the jitter: a finite mean, an infinite variance
 _BURST_MS = (200.0, 800.0)
+_NAME = "tcp://simulated:1212"
 
 
 class PeerKind(StrEnum):
@@ -95,14 +96,11 @@ class SimulatedNetwork:
         timeline: Timeline,
         clock: Clock,
         rng: np.random.Generator,
-        *,
-        name: str = "tcp://simulated:1212",
     ) -> None:
         self._instrument = instrument
         self._timeline = timeline
         self._clock = clock
         self._rng = rng
-        self._name = name
         self._port: _SimulatedConnection | None = None
         self._request_at_ns = self._response_at_ns = 0
         self.faults = NetworkFaults()
@@ -115,18 +113,18 @@ class SimulatedNetwork:
         stall_ns = faults.stalled_until_ns - self._timeline.now_ns()
         if faults.half_open or faults.peer is PeerKind.UNREACHABLE or stall_ns > _CONNECT_TIMEOUT_NS:
             await self._sleep(_CONNECT_TIMEOUT_NS)
-            raise InstrumentError(f"{self._name}: no answer")
+            raise InstrumentError(f"{_NAME}: no answer")
         if stall_ns > 0:
             await self._sleep(stall_ns)
         if faults.peer is PeerKind.REFUSED:
-            raise InstrumentError(f"{self._name} cannot be connected: nothing listens there")
+            raise InstrumentError(f"{_NAME} cannot be connected: nothing listens there")
         if self._port is not None:
-            raise InstrumentError(f"{self._name} is already connected")
+            raise InstrumentError(f"{_NAME} is already connected")
         self._request_at_ns = self._response_at_ns = 0
-        self._port = _SimulatedConnection(self._name, self._send, self._closed)
+        self._port = _SimulatedConnection(_NAME, self._send, self._closed)
         if faults.peer is PeerKind.CLOSING:
             self.drop()
-            raise InstrumentError(f"{self._name}: the connection was closed at once")
+            raise InstrumentError(f"{_NAME}: the connection was closed at once")
         return self._port
 
     def drop(self) -> None:

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from tsgt.simulation.options import SimulationOptions
 
 
+REPORT_S = 25
+"""Before the end: two status reports of a station, each once in 32 frames, have arrived by the end of the drain."""
+
 MEMORY_CHECK_S = 60
 """Usual interval of the memory checks."""
 
@@ -105,6 +108,9 @@ def simulate(
             for second in range(1, math.ceil(options.duration_s) + 1):
                 await mission.run_until(min(second, options.duration_s))
                 progress(mission.now_s)
+                if second == math.ceil(options.duration_s) - REPORT_S:
+                    for station_log in mission.station_logs.values():
+                        station_log.reportable_status = await station_log.client_status()
                 if second % memory_check_s == 0:
                     oversized.update(oversized_collections())
             airtime_s = mission.air.airtime_ns / 1e9

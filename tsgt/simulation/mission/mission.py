@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +20,6 @@ from tsgt.estimation import start_now
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
 from tsgt.radio.superframe.wire import KEY_BYTES
-from tsgt.recording import decode
 from tsgt.simulation.imu import IMU_MODELS, ImuProgram, simulate_imu
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import DriftingClock, VirtualClock, drift_ramp
@@ -31,7 +29,6 @@ from tsgt.simulation.mission.authors_node import AuthorsNode
 from tsgt.simulation.mission.computer import MASTER, ClientClock, Computer
 from tsgt.simulation.mission.config_edits import NO_EDIT, MasterEdit
 from tsgt.simulation.mission.daemon_configs import (
-    STATUS_SOCKET,
     client_config,
     instrument_config,
     master_config,
@@ -46,7 +43,7 @@ from tsgt.simulation.mission.setup_mistakes import NO_MISTAKE, SetupMistake
 from tsgt.simulation.mission.station_log import StationLog
 from tsgt.simulation.wheel_odometry import OdometryModel, OdometryProgram, simulate_odometry
 from tsgt.simulation.world import is_shaken, scenario_world
-from tsgt.station import ClientDependencies, ClientStatus, run_client
+from tsgt.station import ClientDependencies, run_client
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
@@ -502,13 +499,10 @@ class Mission:
         await self.restart(None, self.now_s)
 
     async def _record_status(self, name: str) -> None:
-        """Record a client's status before it ends; the authors' node has none."""
-        for station_log in self.station_logs.values():
-            if name == station_name(station_log.station) and station_log.folder is not None:
-                with suppress(OSError):  # just started, not listening yet
-                    reader, writer = await asyncio.open_unix_connection(station_log.folder / STATUS_SOCKET)
-                    station_log.statuses.append(decode(ClientStatus, await reader.readline()))
-                    writer.close()
+        """Record a client's status before it ends."""
+        for number, station_log in self.station_logs.items():
+            if name == station_name(number) and (status := await station_log.client_status()) is not None:
+                station_log.statuses.append(status)
 
     async def restart(self, station: int | None, at_s: float) -> None:
         """Stop a client (None: the master) at a true time in s from the start, and restart it.

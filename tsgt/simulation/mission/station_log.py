@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-from tsgt.recording import decode_line, read_lines
+from tsgt.recording import decode, decode_line, read_lines
 from tsgt.recording.journal import AcknowledgedRecord, load_journal
+from tsgt.simulation.mission.daemon_configs import STATUS_SOCKET
 from tsgt.simulation.mission.disk import UNWRITTEN_WINDOW_NS
+from tsgt.station import ClientStatus
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,7 +20,6 @@ if TYPE_CHECKING:
 
     from tsgt.model import PolarMeasurement
     from tsgt.simulation.instrument import ReportedDistance
-    from tsgt.station import ClientStatus
 
 _HEAD_LINES = 2
 # Tasks of a killed daemon may run a little longer.
@@ -48,6 +51,7 @@ class StationLog:
     read_times_ns: dict[int, int] = field(default_factory=dict)
     crash_windows_ns: list[tuple[int, int]] = field(default_factory=list)
     statuses: list[ClientStatus] = field(default_factory=list)  # status of the client before each end
+    reportable_status: ClientStatus | None = None  # so long before the end that the master must know it
 
     def may_be_unwritten(self, true_ns: int, before_ns: int = 0, *, write_errors_only: bool = False) -> bool:
         """Whether a client was killed before it must have journalled what it read at a true time in ns from the start.
@@ -64,6 +68,17 @@ class StationLog:
     def journals(self) -> list[Path]:
         """Its journals, one per start."""
         return [] if self.folder is None else sorted(self.folder.glob("*.jsonl"))
+
+    async def client_status(self) -> ClientStatus | None:
+        """Return the status of the running client; None if it is not listening, and of the authors' node, which has none."""
+        if self.folder is None:
+            return None
+        with suppress(OSError):
+            reader, writer = await asyncio.open_unix_connection(self.folder / STATUS_SOCKET)
+            status = decode(ClientStatus, await reader.readline())
+            writer.close()
+            return status
+        return None
 
 
 class JournalIndex:

@@ -16,7 +16,7 @@ from tsgt.simulation.checks.station_reports import report_failures
 SECOND = 1_000_000_000
 
 
-def _result(*, drain_hz: float = -1.0, battery: int = 85, bytes_per_s: int = 0) -> Any:
+def _result(*, drain_hz: float = -1.0, battery: int = 85, at_end: int = 85, bytes_per_s: int = 0) -> Any:
     """Return a mission of 20 s in which one station gets one more outstanding measurement each second."""
     statuses = [
         SimpleNamespace(
@@ -36,8 +36,9 @@ def _result(*, drain_hz: float = -1.0, battery: int = 85, bytes_per_s: int = 0) 
     ]
     full = SimpleNamespace(event="disk_full", stamp_ns=START + 5 * SECOND)
     log = SimpleNamespace(statuses=statuses, events=[full], unix_at_zero_ns=START)
-    client = SimpleNamespace(battery_percent=85)
-    return SimpleNamespace(master_logs=[log], station_logs={1: SimpleNamespace(statuses=[client])})
+    before, newer, last = (SimpleNamespace(battery_percent=percent) for percent in (60, 85, at_end))
+    station_log = SimpleNamespace(statuses=[before, last], reportable_status=newer)
+    return SimpleNamespace(master_logs=[log], station_logs={1: station_log})
 
 
 @pytest.mark.parametrize(
@@ -46,11 +47,13 @@ def _result(*, drain_hz: float = -1.0, battery: int = 85, bytes_per_s: int = 0) 
         ({}, ""),
         ({"drain_hz": 1.0}, "drains"),
         ({"battery": 100}, "battery"),
+        ({"battery": 60}, "battery"),  # of before
+        ({"at_end": 95}, ""),  # read too late to arrive
         ({"bytes_per_s": 100}, "is written"),
     ],
 )
 def test_wrong_report_is_detected(change: dict[str, Any], what: str) -> None:
-    """A drain rate with the wrong sign, another battery, a disk that is full no longer."""
+    """A drain rate with the wrong sign, another battery or an old one, a disk that is full no longer."""
     found = list(report_failures(_result(**change)))
     assert len(found) == bool(what)
     assert all(what in each for each in found)

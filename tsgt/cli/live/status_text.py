@@ -12,10 +12,10 @@ import click
 from tsgt.cli.output import printable
 from tsgt.cli.render import clock_time
 from tsgt.model import Status
+from tsgt.recording import LOW_DISK_BYTES
 
 if TYPE_CHECKING:
     from tsgt.recording import (
-        DiskStatus,
         ImuStatus,
         OdometryStatus,
         RecordingStatus,
@@ -95,27 +95,35 @@ def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:
         label, ok = odometry_label(record.odometry)
         blocks.append([_headline(f"ODOMETRY  {label}", ok=ok), *_odometry_lines(record.odometry)])
         problems += [] if ok else [f"wheel odometry: {label}"]
+    label, problem = _disk_label(record)
+    problems += [problem] if problem else []
     if record.recording is not None:
-        block, ok = _recording_block(record.recording, record.disk, record.stamp_ns)
-        blocks.append(block)
-        problems += [] if ok else ["the disk of the recording fails"]
+        headline = _headline(f"RECORDING  {label}", ok=not problem)
+        blocks.append([headline, *_recording_lines(record.recording, record)])
     return blocks, problems
 
 
-def _recording_block(recording: RecordingStatus, disk: DiskStatus | None, now_ns: int) -> tuple[Block, bool]:
-    ok = _recording_ok(recording, now_ns)
-    lines = [_headline(f"RECORDING  {'OK' if ok else 'DISK FAILS'}", ok=ok)]
-    lines += wrapped(recording.file, "  ")
-    space = "" if disk is None else f", disk {_size_text(disk.free_bytes)} free"
+def _disk_label(record: StatusRecord) -> tuple[str, str]:
+    """Return the state of the disk in a word or two, and what requires action; empty: nothing."""
+    if record.recording is not None and not _is_written(record.recording, record.stamp_ns):
+        return "DISK FAILS", "the disk of the recording fails"
+    if record.disk is not None and record.disk.free_bytes < LOW_DISK_BYTES:
+        return "DISK NEARLY FULL", "the disk is nearly full"
+    return "OK", ""
+
+
+def _recording_lines(recording: RecordingStatus, record: StatusRecord) -> Block:
+    lines = wrapped(recording.file, "  ")
+    space = "" if record.disk is None else f", disk {_size_text(record.disk.free_bytes)} free"
     lines.append(f"  {_size_text(recording.bytes)}{space}")
-    if not ok:
+    if not _is_written(recording, record.stamp_ns):
         lines.append(f"  {recording.waiting_lines} lines not written yet")
     if recording.lost_lines:
         lines.append(f"  {recording.lost_lines} lines lost")
-    return lines, ok
+    return lines
 
 
-def _recording_ok(recording: RecordingStatus, now_ns: int) -> bool:
+def _is_written(recording: RecordingStatus, now_ns: int) -> bool:
     written_ns = recording.last_write_ns
     return recording.waiting_lines == 0 or (
         written_ns is not None and now_ns - written_ns < MAX_WRITE_AGE_S * 1e9

@@ -16,7 +16,7 @@ from tsgt.cli.live.pose_text import pose_block
 from tsgt.cli.live.status_text import NO_KEY, client_text, duration, master_blocks
 from tsgt.cli.output import printable
 from tsgt.cli.render import clock_time
-from tsgt.recording import LOW_DISK_BYTES, EventRecord, PoseRecord, StatusRecord, Typed, decode
+from tsgt.recording import EventRecord, PoseRecord, StatusRecord, Typed, decode
 from tsgt.station import ClientStatus
 
 if TYPE_CHECKING:
@@ -120,8 +120,6 @@ def _problems(status: StatusRecord | None, pose: PoseRecord) -> Sequence[str]:
     problems: list[str] = []
     if status is not None:
         problems += master_blocks(status)[1]
-        if status.disk is not None and status.disk.free_bytes < LOW_DISK_BYTES:
-            problems.append("the disk is nearly full")
     problems += [cause.replace("_", " ") for cause in pose.degraded_by]
     if status is not None and status.protocol == "superframe" and not status.authenticated:
         problems.append(NO_KEY)

@@ -104,7 +104,7 @@ def test_master_without_problems() -> None:
 
 
 def test_recording_and_disk_are_shown() -> None:
-    """Lines that have been waiting for seconds are a problem; those of the last second are not."""
+    """Lines that have been waiting for seconds and a disk with little space are problems; lines of the last second are not."""
     recording = RecordingStatus(
         file="master-20261121T055100Z.jsonl",
         bytes=12_345_678,
@@ -120,6 +120,10 @@ def test_recording_and_disk_are_shown() -> None:
         "  master-20261121T055100Z.jsonl",
         "  12.3 MB, disk 20.0 GB free",
     ]
+    little = dataclasses.replace(disk, free_bytes=900_000_000)
+    lines, well = master_text(dataclasses.replace(MASTER, recording=recording, disk=little))
+    assert not well
+    assert lines[-3] == click.style("RECORDING  DISK NEARLY FULL", bold=True, reverse=True)
     full = dataclasses.replace(recording, last_write_ns=NOW_NS - 9_000_000_000, lost_lines=1)
     lines, well = master_text(dataclasses.replace(MASTER, recording=full))
     assert not well

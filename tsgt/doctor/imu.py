@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.clock import UnixTimeline
 from tsgt.doctor.finding import failed, note, ok
-from tsgt.doctor.sensor_program import obstacle, status_after
+from tsgt.doctor.sensor_program import program_unavailable, status_after
 from tsgt.imu import Imu
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ async def check_imu(machine: Machine, config: ImuConfig | None, *, daemon: bool)
     """Run the program for some seconds; the robot must be at rest. None configured: no finding."""
     if config is None:
         return []
-    if (found := obstacle(machine, "imu", config.command, daemon=daemon)) is not None:
+    if (found := program_unavailable(machine, "imu", config.command, daemon=daemon)) is not None:
         return [found]
     records: list[ImuSamples] = []
     imu = Imu(

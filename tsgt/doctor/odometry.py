@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.clock import UnixTimeline
 from tsgt.doctor.finding import failed, note, ok
-from tsgt.doctor.sensor_program import obstacle, status_after
+from tsgt.doctor.sensor_program import program_unavailable, status_after
 from tsgt.imu import WheelOdometry
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ async def check_odometry(machine: Machine, config: OdometryConfig | None, *, dae
     """Run the program for some seconds; the robot must be at rest. None configured: no finding."""
     if config is None:
         return []
-    if (found := obstacle(machine, "odometry", config.command, daemon=daemon)) is not None:
+    if (found := program_unavailable(machine, "odometry", config.command, daemon=daemon)) is not None:
         return [found]
     records: list[OdometrySamples] = []
     odometry = WheelOdometry(

@@ -27,7 +27,9 @@ class SensorProgram(Protocol[StatusT_co]):
         ...
 
 
-def obstacle(machine: Machine, section: str, command: Sequence[str], *, daemon: bool) -> Finding | None:
+def program_unavailable(
+    machine: Machine, section: str, command: Sequence[str], *, daemon: bool
+) -> Finding | None:
     """Return why the program of a section of the configuration cannot be run; None: it can."""
     if daemon:
         return skipped(section, "the running master reads it; `tsgt listen` and its status show how well")

@@ -98,7 +98,7 @@ _REJECTED_USES = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
 class ImuSelector:
     """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
 
-    ``without``, ``create_with``: the window without IMU, and what makes one with it, anew after each disagreement.
+    ``without``, ``create_with``: the window without IMU, and what makes one with it: the first, and another after each disagreement.
     ``setup``: monitors the set-up of the IMU; None: nothing does. ``prisms``: of the layout. ``use``: whether poses rest on the
     IMU, and why not. ``station_contradicted``: whether the IMU has contradicted one or two stations, and the trajectory follows them
     nevertheless, because nothing tells which of the two is wrong.
@@ -215,7 +215,7 @@ class ImuSelector:
 
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time."""
-        # A window that was begun anew starts with the samples since; measurements from before still arrive.
+        # A window that replaces another starts with the samples since; measurements from before still arrive.
         within = new.time_s >= self._with.horizon_s
         if within.any():
             self._with.update(new if within.all() else new.select(within))

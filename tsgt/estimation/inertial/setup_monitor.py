@@ -196,7 +196,7 @@ class ImuSetupMonitor:
         return events
 
     def restart(self, *, shock: bool = False) -> None:
-        """Confirm the set-up anew, from what comes from now on: it may have changed.
+        """Confirm the set-up again, from what comes from now on: it may have changed.
 
         After a ``shock`` fewer than three prisms confirm nothing any more: they do not tell all rotations, and what they do not tell
         is not as configured for certain.

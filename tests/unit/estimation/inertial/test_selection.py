@@ -338,7 +338,7 @@ def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
 
 
 @pytest.mark.parametrize(
-    ("prisms", "in_doubt", "expected"),
+    ("prisms", "uncertain", "expected"),
     [(3, False, [4.0, 8.0, 16.0, 4.0]), (2, True, [4.0, 8.0, 16.0, 4.0]), (2, False, [4.0, 4.0, 4.0, 4.0])],
 )
 def test_quarantine_doubles_with_each_disagreement_in_a_row(
@@ -347,12 +347,12 @@ def test_quarantine_doubles_with_each_disagreement_in_a_row(
     prisms: int,
     expected: list[float],
     *,
-    in_doubt: bool,
+    uncertain: bool,
 ) -> None:
     """And is short again after a minute of use; it stays short where two prisms alone lose their poses to what the samples show."""
     selector, window, setup = sound
     monkeypatch.setattr(selector, "_prisms", prisms)
-    window.setup_uncertain, window.followed_for_s = in_doubt, 0.0
+    window.setup_uncertain, window.followed_for_s = uncertain, 0.0
     setup.restart = lambda **_: None
     found, now_s = [], 0.0
     for used_s in (1.0, 1.0, 1.0, PROVEN_S + 1.0):

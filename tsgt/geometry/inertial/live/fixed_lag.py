@@ -168,7 +168,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         A reason is given while values are stuck, beyond any range, or at the limit of an axis; where the newest sample
         is older than 0.4 s at the time of a prediction; and when two prisms disagree with the samples within 1.2 s (one, three times
         in succession, where none other is measured). Stuck values and values beyond any range are left out. When prisms
-        disagree, the trajectory is started anew from what comes after. Save for old samples, the reason stays for 2 s after its last cause; then, and
+        disagree, the trajectory is initialised again from what comes after. Save for old samples, the reason stays for 2 s after its last cause; then, and
         once there is a trajectory again, the samples are used. :class:`~tsgt.geometry.inertial.live.health.HealthMonitor` gives the
         grounds of the thresholds.
         """

@@ -106,7 +106,7 @@ class ContinuousEstimator:
     def _window(self) -> MeasurementWindow:
         return self._without_imu if self._imu is None else self._imu.window
 
-    def _create_with_imu(self) -> InertialFixedLagSmoother:
+    def _create_with_imu(self, min_prisms: int) -> InertialFixedLagSmoother:
         assert self._parameters.imu is not None  # noqa: S101 (only called with one)
         uncertainty = InertialSetupUncertainty.of(self._parameters)
         return InertialFixedLagSmoother(
@@ -117,6 +117,7 @@ class ContinuousEstimator:
             mounting_factor=uncertainty.mounting_factor,
             odometry=self._parameters.odometry,
             saturation=self._saturation,
+            min_prisms=min_prisms,
         )
 
     def begin_at(self, now_ns: int) -> None:

@@ -98,7 +98,8 @@ _REJECTED_USES = ImuUse.DISAGREES, ImuUse.WRONG_SETUP
 class ImuSelector:
     """The windows of the estimator ``continuous`` with an IMU, and which of them to use.
 
-    ``without``, ``create_with``: the window without IMU, and what makes one with it: the first, and another after each disagreement.
+    ``without``, ``create_with``: the window without IMU, and what makes one with it, which starts from a number of prisms: the
+    first, and another after each disagreement.
     ``setup``: monitors the set-up of the IMU; None: nothing does. ``prisms``: of the layout. ``use``: whether poses rest on the
     IMU, and why not. ``station_contradicted``: whether the IMU has contradicted one or two stations, and the trajectory follows them
     nevertheless, because nothing tells which of the two is wrong.
@@ -108,7 +109,7 @@ class ImuSelector:
         self,
         imu: ImuParameters,
         without: MeasurementWindow,
-        create_with: Callable[[], InertialFixedLagSmoother],
+        create_with: Callable[[int], InertialFixedLagSmoother],
         setup: ImuSetupMonitor | None = None,
         *,
         prisms: int = MIN_PRISMS,
@@ -120,7 +121,8 @@ class ImuSelector:
         self._setup, self._prisms = setup, prisms
         self._established = self.station_contradicted = False
         self._was_ambiguous = False  # The trajectory with the IMU
-        self._with = create_with()
+        self._start_prisms = 1
+        self._with = create_with(self._start_prisms)
         self._waiting: list[Observations] = []  # for the window without IMU
         self._converter: SampleConverter | None = None
         self._records: deque[ImuSamples] = deque()
@@ -246,7 +248,12 @@ class ImuSelector:
                 longer = 2 if uncertain or self._prisms >= MIN_PRISMS else 1
                 self._quarantine_s = min(longer * self._quarantine_s, MAX_QUARANTINE_S) if again else 0.0
             self._contradicted_from_s, self._nis, self._contradiction = np.inf, (0.0, 0.0), ""
-            self._with = self._create_with()
+            # A prism measured alone, of several, may be the wrong one, with which a right IMU disagreed.
+            if uncertain:
+                self._start_prisms = min(2, self._prisms)
+            elif self._with.converged:
+                self._start_prisms = 1
+            self._with = self._create_with(self._start_prisms)
             self._quarantine_s = max(self._quarantine_s, QUARANTINE_S)
             self._usable_from_s = now_s + self._quarantine_s
         elif found == ImuUse.SILENT:

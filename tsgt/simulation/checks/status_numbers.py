@@ -33,6 +33,9 @@ MAX_WRONG_OFFSETS, MIN_OFFSETS = 0.1, 20
 HEARD_TOLERANCE_S = 0.005
 """Jitter of the stamps of received packets."""
 
+_FOLLOWING = 100_000
+"""Numbers by which a station's measurements go on, also after it was restarted; random ones are further away."""
+
 FRESH_S = 1.0
 """Maximum age of a measurement whose stamp tells the clock offset of the status."""
 
@@ -62,12 +65,16 @@ class _Published:
     measurements: list[PolarMeasurement] = field(default_factory=list)
     usable_count: int = 0
     newest: PolarMeasurement | None = None  # by time; an older one may arrive late
+    following: PolarMeasurement | None = None  # by number, of those that follow it
 
     def add(self, measurement: PolarMeasurement) -> None:
         self.measurements.append(measurement)
         self.usable_count += usable(measurement)
         if self.newest is None or measurement.stamp_ns > self.newest.stamp_ns:
-            self.newest = measurement
+            self.newest = self.following = measurement
+        assert self.following is not None  # noqa: S101 (set with the newest)
+        if 0 < measurement.sequence - self.following.sequence < _FOLLOWING:
+            self.following = measurement
 
 
 def _stations(master_log: MasterLog) -> Iterator[tuple[float, StationStatus, _Published, str]]:
@@ -102,8 +109,9 @@ def _problem(
     ]
     if published.newest is not None:
         first, last = published.measurements[0], published.measurements[-1]
-        # The newest by time, or by arrival: an older one may arrive late, and a station's clock may have been stepped.
-        newest = (published.newest, last)
+        # The newest by time, by arrival, or by number: an older one may arrive late, a station's clock may have been stepped,
+        # and the stamp of a distance may precede that of the angles read before it.
+        newest = [each for each in (published.newest, last, published.following) if each is not None]
         span_ns = min(RATE_WINDOW_NS, max(now_ns - first.received_ns, MIN_RATE_SPAN_NS))
         count = 0
         for measurement in reversed(published.measurements):

@@ -267,7 +267,7 @@ def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
     setup = SimpleNamespace(untrusted=None, confirmed=False)
     selector = ImuSelector(
-        IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
+        IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), cast("Any", setup)
     )
     selector.begin(START)
     uses = []
@@ -298,9 +298,12 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace
     )
     setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="", shock=False)
     setup.restart = lambda *, shock: vars(setup).update(confirmed=False, shock=shock)
-    selector = ImuSelector(
-        IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), cast("Any", setup)
-    )
+
+    def create_with(min_prisms: int) -> Any:
+        window.min_prisms = min_prisms
+        return window
+
+    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), create_with, cast("Any", setup))
     selector.begin(START)
     return selector, window, setup
 
@@ -338,6 +341,33 @@ def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
 
 
 @pytest.mark.parametrize(
+    ("fault", "prisms", "expected"), [("prisms", 3, 2), ("prisms", 2, 2), ("prisms", 1, 1), ("stuck", 3, 1)]
+)
+def test_new_window_needs_two_prisms_where_the_wrong_prism_may_have_been_measured(
+    sound: tuple[ImuSelector, SimpleNamespace, SimpleNamespace],
+    monkeypatch: pytest.MonkeyPatch,
+    fault: str,
+    prisms: int,
+    expected: int,
+) -> None:
+    """After the prisms have contradicted the IMU, not after samples that are wrong by themselves; and until there is a trajectory."""
+    selector, window, _ = sound
+    monkeypatch.setattr(selector, "_prisms", prisms)
+    window.followed_for_s = 0.0
+    uses_of(selector, 0.0, 1.0)
+    found = [window.min_prisms]
+    window.health, window.setup_uncertain = fault, fault == "prisms"
+    uses_of(selector, 1.0, 1.1)
+    found.append(window.min_prisms)
+    window.health, window.setup_uncertain = "stuck", False
+    for converged in (False, True):
+        window.converged = converged
+        uses_of(selector, 1.1, 1.2)
+        found.append(window.min_prisms)
+    assert found == [1, expected, expected, 1]
+
+
+@pytest.mark.parametrize(
     ("prisms", "uncertain", "expected"),
     [(3, False, [4.0, 8.0, 16.0, 4.0]), (2, True, [4.0, 8.0, 16.0, 4.0]), (2, False, [4.0, 4.0, 4.0, 4.0])],
 )
@@ -372,7 +402,7 @@ def test_samples_between_rare_poses_are_all_used() -> None:
     driven: list[WheelSamples] = []
     window = SimpleNamespace(add_samples=taken.append, add_odometry=driven.append)
     selector = ImuSelector(
-        IMU_PARAMETERS, cast("Any", None), lambda: cast("Any", window), odometry=OdometryParameters()
+        IMU_PARAMETERS, cast("Any", None), lambda _: cast("Any", window), odometry=OdometryParameters()
     )
     for number in range(60):  # Half seconds
         if number == 40:
@@ -475,7 +505,7 @@ def test_contradiction_of_one_or_two_stations_lasts(
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
     window.setup_uncertain = window.shock = False
-    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda: cast("Any", window), prisms=prisms)
+    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=prisms)
     selector.begin(START)
     found = []
     for number in range(20):

@@ -45,9 +45,15 @@ class Live:
         gyro_only: bool = False,
         setup_jacobian: SetupJacobian | None = None,
         imu: ImuParameters = IMU,
+        min_prisms: int = 1,
     ) -> None:
         self.window = InertialFixedLagSmoother(
-            imu, MotionPrior(), reference_m=CENTROID, setup_jacobian=setup_jacobian, gyro_only=gyro_only
+            imu,
+            MotionPrior(),
+            reference_m=CENTROID,
+            setup_jacobian=setup_jacobian,
+            gyro_only=gyro_only,
+            min_prisms=min_prisms,
         )
         self._sampled = 0
 
@@ -242,6 +248,23 @@ def test_backlog_and_an_outage_at_once() -> None:
     assert 0.005 < steps_s.min() <= steps_s.max() < 0.51
     for time_s in observations.time_s[held_back | later]:
         assert np.abs(knots_s - time_s).min() <= 0.0101
+
+
+@pytest.mark.slow
+def test_no_start_from_one_prism_where_two_are_needed() -> None:
+    """The second one ends the wait once it has been measured twice."""
+    observations = measurements(2)
+    second = np.flatnonzero((observations.station == 1) & (observations.time_s > 5.0))
+    alone = np.flatnonzero(observations.station == 0)
+    live = Live(min_prisms=2)
+    rows = np.sort(np.concatenate([alone, second]))
+    last_s = float(observations.time_s[second[1]])
+    found = []
+    for row in rows[observations.time_s[rows] < UNTIL_S]:
+        live.measure(observations.select(slice(row, row + 1)))
+        found.append((float(observations.time_s[row]), live.window.converged))
+    assert not any(converged for time_s, converged in found if time_s < last_s)
+    assert found[-1][1]
 
 
 @pytest.mark.slow

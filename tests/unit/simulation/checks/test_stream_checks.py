@@ -165,6 +165,22 @@ def test_status_with_a_wrong_number(tmp_path: Path, change: dict[str, Any], coun
     assert len(list(status_failures(log, _INDICES))) == count
 
 
+@pytest.mark.parametrize(("late_ms", "count"), [(48, 0), (0, 0), (20, 1)])
+def test_age_of_a_distance_stamped_before_the_angles_that_precede_it(
+    tmp_path: Path, late_ms: int, count: int
+) -> None:
+    """Measurement 1 precedes 0 by 48 ms; then an older one arrives."""
+    old, first, second = (
+        replace(measurement(number), sequence=sequence, stamp_ns=START + 400_000_000 - late * 1_000_000)
+        for number, sequence, late in ((0, 100, 0), (1, 101, 48), (2, 20, 300))
+    )
+    status = _status(
+        measurements=3, usable=3, rate_hz=3.0, age_s=0.6 + late_ms / 1e3, status=Status.OK, last_heard_s=0.0
+    )
+    found = list(status_failures(_log(tmp_path, old, first, second, POSE, POSE, status), _INDICES))
+    assert len(found) == count
+
+
 @pytest.mark.parametrize(("offset_ns", "count"), [(5_000, 0), (50_000, 1), (-50_000, 1)])
 def test_clock_offset_beyond_its_bound(tmp_path: Path, offset_ns: int, count: int) -> None:
     """In each of 30 statuses; the station's clock is that of the master."""

@@ -85,7 +85,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
 
     ``observations`` have the layout in the axes of the robot from a reference point, whose states it gives.
     ``reliable_from_s``: each prism must have been measured twice; the first measurement, with nothing to contradict it, may be
-    of a wrong prism.
+    of a wrong prism. ``min_prisms``: how many prisms a start needs.
     """
 
     def __init__(
@@ -99,6 +99,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         gyro_only: bool = False,
         odometry: OdometryParameters | None = None,
         saturation: SaturationMonitor | None = None,
+        min_prisms: int = 1,
     ) -> None:
         super().__init__(InnovationMonitor(CONSISTENT_ALONE))
         self._noise = estimation_noise(imu.noise)
@@ -115,7 +116,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         if not gyro_only:
             gravity = gravity.with_matrix(imu.noise.accelerometer_scale_misalignment, mounting.rotation[2])
         self._gravity = gravity
-        self._search = StartSearch(self._noise, self._gyro_only, gravity)
+        self._search = StartSearch(self._noise, self._gyro_only, gravity, min_prisms)
         self._health = HealthMonitor(imu, saturation)
         self._rotation_predictor = RotationPredictor()
         self._window: KnotWindow | None = None

@@ -35,10 +35,16 @@ DIFFUSE_SIGMAS = np.repeat([1.0, 1.0, 10.0], 3)
 
 
 class StartSearch:
-    """Finds a trajectory without any prior knowledge, and not at every new measurement."""
+    """Finds a trajectory without any prior knowledge, and not at every new measurement.
 
-    def __init__(self, noise: ImuNoise, gyro_only: MotionPrior | None, gravity: Gravity) -> None:
+    ``min_prisms``: how many prisms must have been measured twice.
+    """
+
+    def __init__(
+        self, noise: ImuNoise, gyro_only: MotionPrior | None, gravity: Gravity, min_prisms: int
+    ) -> None:
         self._noise, self._gyro_only, self._gravity = noise, gyro_only, gravity
+        self._min_prisms = min_prisms
         self._next_s = -np.inf
 
     def restart(self) -> None:
@@ -56,7 +62,10 @@ class StartSearch:
         newest_s = float(observations.time_s[-1])
         if newest_s < self._next_s:
             raise GeometryError("too little measured since the last search")
-        if len(np.unique(observations.prism)) == 1 and _path_m(observations) < MIN_PATH_M:
+        counts = np.bincount(observations.prism)
+        if np.count_nonzero(counts > 1) < self._min_prisms:
+            raise GeometryError(f"fewer than {self._min_prisms} prisms have been measured twice")
+        if np.count_nonzero(counts) == 1 and _path_m(observations) < MIN_PATH_M:
             raise GeometryError("one prism alone tells the heading of a robot only in motion")
         length_s = newest_s - float(observations.time_s[0])
         self._next_s = newest_s + max(MIN_STEP_S, (GROWTH - 1.0) * length_s)

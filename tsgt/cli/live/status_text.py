@@ -12,7 +12,18 @@ import click
 from tsgt.cli.output import printable
 from tsgt.cli.render import clock_time
 from tsgt.model import Status
-from tsgt.recording import LOW_DISK_BYTES
+from tsgt.recording.conditions import (
+    MAX_AGE_S,
+    DiskCondition,
+    RecordingCondition,
+    SensorCondition,
+    StationCondition,
+    disk_condition,
+    imu_condition,
+    odometry_condition,
+    recording_condition,
+    station_condition,
+)
 
 if TYPE_CHECKING:
     from tsgt.recording import (
@@ -24,14 +35,6 @@ if TYPE_CHECKING:
     )
     from tsgt.recording.journal import InstrumentRecord
     from tsgt.station import ClientStatus
-
-MAX_AGE_S = 3.0
-"""A station whose last packet or measurement is older needs the operator."""
-
-MAX_IMU_AGE_S = 1.0
-
-MAX_WRITE_AGE_S = 5.0
-"""Lines that wait for longer are not written because the disk is full or fails."""
 
 MAX_MASTER_AGE_S = 10.0
 """While the master synchronises another station, a client receives nothing for a second or two."""
@@ -95,39 +98,42 @@ def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:
         label, ok = odometry_label(record.odometry)
         blocks.append([_headline(f"ODOMETRY  {label}", ok=ok), *_odometry_lines(record.odometry)])
         problems += [] if ok else [f"wheel odometry: {label}"]
-    label, problem = _disk_label(record)
-    problems += [problem] if problem else []
+    labels = _recording_labels(record)
+    problems += [problem for _, problem in labels]
     if record.recording is not None:
-        headline = _headline(f"RECORDING  {label}", ok=not problem)
+        headline = _headline(f"RECORDING  {labels[0][0] if labels else 'OK'}", ok=not labels)
         blocks.append([headline, *_recording_lines(record.recording, record)])
     return blocks, problems
 
 
-def _disk_label(record: StatusRecord) -> tuple[str, str]:
-    """Return the state of the disk in a word or two, and what requires action; empty: nothing."""
-    if record.recording is not None and not _is_written(record.recording, record.stamp_ns):
-        return "DISK FAILS", "the disk of the recording fails"
-    if record.disk is not None and record.disk.free_bytes < LOW_DISK_BYTES:
-        return "DISK NEARLY FULL", "the disk is nearly full"
-    return "OK", ""
+def _recording_labels(record: StatusRecord) -> list[tuple[str, str]]:
+    """Return each problem of recording and disk in a word or two, and as what requires action, the most urgent first."""
+    disk = disk_condition(record.disk)
+    found = []
+    if record.recording is not None:
+        match recording_condition(record.recording, record.stamp_ns):
+            case RecordingCondition.NOT_WRITTEN:
+                found.append(("DISK FAILS", "the disk of the recording fails"))
+            case RecordingCondition.SLOW:
+                found.append(("DISK SLOW", "the disk of the recording is slow"))
+        if record.recording.lost_lines:
+            found.append(("LINES LOST", f"{record.recording.lost_lines} lines of the recording are lost"))
+    if disk == DiskCondition.FULL:
+        found.insert(0, ("DISK FULL", "the disk is full"))
+    elif disk == DiskCondition.NEARLY_FULL:
+        found.append(("DISK NEARLY FULL", "the disk is nearly full"))
+    return found
 
 
 def _recording_lines(recording: RecordingStatus, record: StatusRecord) -> Block:
     lines = wrapped(recording.file, "  ")
     space = "" if record.disk is None else f", disk {_size_text(record.disk.free_bytes)} free"
     lines.append(f"  {_size_text(recording.bytes)}{space}")
-    if not _is_written(recording, record.stamp_ns):
+    if recording_condition(recording, record.stamp_ns) != RecordingCondition.WRITTEN:
         lines.append(f"  {recording.waiting_lines} lines not written yet")
     if recording.lost_lines:
         lines.append(f"  {recording.lost_lines} lines lost")
     return lines
-
-
-def _is_written(recording: RecordingStatus, now_ns: int) -> bool:
-    written_ns = recording.last_write_ns
-    return recording.waiting_lines == 0 or (
-        written_ns is not None and now_ns - written_ns < MAX_WRITE_AGE_S * 1e9
-    )
 
 
 def _size_text(size: int) -> str:
@@ -137,17 +143,26 @@ def _size_text(size: int) -> str:
 
 def imu_label(imu: ImuStatus) -> tuple[str, bool]:
     """Return the state of the IMU in a word or two, and whether no action is required."""
-    if imu.age_s is None:
-        return "NO SAMPLES YET", False
-    if imu.age_s > MAX_IMU_AGE_S:
-        return f"SILENT {duration(imu.age_s)}", False
-    if imu.problem:
-        return "CHECK IT", False
-    if imu.use == "wrong_setup":
-        return "ITS SET-UP IS WRONG", False
-    if imu.use == "disagrees" or (imu.disagreement and imu.use != "unconfirmed"):
-        return "DISAGREES WITH THE PRISMS", False
-    return ("NOT IN USE YET" if imu.use in {"starting", "unconfirmed"} else "OK"), True
+    condition = imu_condition(imu)
+    return _sensor_label(condition, imu.age_s), condition.ok
+
+
+_SENSOR_LABELS = {
+    SensorCondition.NO_SAMPLES: "NO SAMPLES YET",
+    SensorCondition.FAULTY: "CHECK IT",
+    SensorCondition.WRONG_SETUP: "ITS SET-UP IS WRONG",
+    SensorCondition.DISAGREES: "DISAGREES WITH THE PRISMS",
+    SensorCondition.UNCONFIRMED: "NOT CONFIRMED",
+    SensorCondition.STARTING: "NOT IN USE YET",
+    SensorCondition.WITHOUT_IMU: "NOT IN USE: NO IMU",
+    SensorCondition.USED: "OK",
+}
+
+
+def _sensor_label(condition: SensorCondition, age_s: float | None) -> str:
+    if condition == SensorCondition.SILENT and age_s is not None:
+        return f"SILENT {duration(age_s)}"
+    return _SENSOR_LABELS[condition]
 
 
 def _imu_lines(imu: ImuStatus) -> list[str]:
@@ -168,20 +183,17 @@ def _imu_lines(imu: ImuStatus) -> list[str]:
         lines.append(f"  acc. bias {x:+.0f} {y:+.0f} {z:+.0f} mm/s^2")
     for text in (imu.problem, imu.disagreement):
         lines += wrapped(text, "  ")
+    if imu_condition(imu) == SensorCondition.UNCONFIRMED:
+        lines.append("  drive curves, accelerate and brake")
     return [line for line in lines if line.strip()]
 
 
 def odometry_label(odometry: OdometryStatus) -> tuple[str, bool]:
     """Return the state of the wheel odometry in a word or two, and whether no action is required."""
-    if odometry.age_s is None:
-        return "NO SAMPLES YET", False
-    if odometry.age_s > MAX_IMU_AGE_S:
-        return f"SILENT {duration(odometry.age_s)}", False
-    if odometry.problem:
-        return "CHECK IT", False
-    if odometry.use == "disagrees":
+    condition = odometry_condition(odometry)
+    if condition == SensorCondition.DISAGREES:
         return "DISAGREES WITH IMU AND PRISMS", False
-    return ("NOT IN USE: NO IMU" if odometry.use == "without_imu" else "OK"), True
+    return _sensor_label(condition, odometry.age_s), condition.ok
 
 
 def _odometry_lines(odometry: OdometryStatus) -> list[str]:
@@ -203,16 +215,19 @@ def _odometry_lines(odometry: OdometryStatus) -> list[str]:
 
 def station_label(station: StationStatus) -> tuple[str, bool]:
     """Return the state of a station in a word or two, and whether no action is required."""
-    if station.last_heard_s is None:
-        return "NOT RECEIVED YET", False
-    if station.last_heard_s > MAX_AGE_S and not station.answering:
-        return f"SILENT {duration(station.last_heard_s)}", False
-    if station.status is None or station.age_s is None:
-        return "NO MEASUREMENT YET", False
-    # The station responds, but always with the same measurement.
-    if station.status.usable and station.age_s - station.last_heard_s > MAX_AGE_S:
-        return f"NO MEASUREMENT FOR {duration(station.age_s)}", False
-    return LABELS[station.status], station.status.usable
+    condition = station_condition(station)
+    match condition:
+        case StationCondition.NOT_RECEIVED:
+            label = "NOT RECEIVED YET"
+        case StationCondition.SILENT:
+            label = f"SILENT {duration(station.last_heard_s or 0.0)}"
+        case StationCondition.NO_MEASUREMENT:
+            label = "NO MEASUREMENT YET"
+        case StationCondition.NO_NEW_MEASUREMENT:
+            label = f"NO MEASUREMENT FOR {duration(station.age_s or 0.0)}"
+        case _:
+            label = "" if station.status is None else LABELS[station.status]
+    return label, condition == StationCondition.TRACKING
 
 
 def _station_lines(station: StationStatus) -> list[str]:

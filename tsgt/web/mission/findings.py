@@ -7,7 +7,15 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from tsgt.polygon import contains, distance_to_edge, edges
-from tsgt.recording import LOW_DISK_BYTES
+from tsgt.recording.conditions import (
+    DiskCondition,
+    RecordingCondition,
+    SensorCondition,
+    disk_condition,
+    imu_condition,
+    odometry_condition,
+    recording_condition,
+)
 from tsgt.web.frames import worst_sigma
 from tsgt.web.mission.verdict import Finding, Level
 
@@ -23,14 +31,6 @@ if TYPE_CHECKING:
         ValidityLimits,
     )
     from tsgt.web.mission.stations import Condition
-
-MAX_IMU_AGE_S = 1.0
-
-MAX_WRITE_AGE_S = 5.0
-MAX_WAITING_LINES = 600
-"""The master records some lines a second at least, and some sixty with poses: these are ten seconds of them."""
-
-FULL_DISK_BYTES = 50_000_000
 
 ALARMS = frozenset(
     {
@@ -272,17 +272,19 @@ def imu_findings(status: StatusRecord | None) -> list[Finding]:
     imu = status.imu if status is not None else None
     if imu is None:
         return []
-    if imu.age_s is None or imu.age_s > MAX_IMU_AGE_S:
-        return [Finding(Level.CARE, "the IMU gives no samples")]
-    if imu.problem:
-        return [Finding(Level.CARE, f"IMU: {imu.problem}")]
-    if imu.use == "wrong_setup":
-        return [Finding(Level.CARE, "the set-up of the IMU is wrong")]
-    if imu.use == "unconfirmed":
-        return [Finding(Level.CARE, UNCONFIRMED)]
-    if imu.use == "disagrees" or imu.disagreement:
-        return [Finding(Level.CARE, "the IMU disagrees with the prisms")]
-    return []
+    texts = {
+        SensorCondition.NO_SAMPLES: "the IMU gives no samples",
+        SensorCondition.SILENT: "the IMU gives no samples",
+        SensorCondition.FAULTY: f"IMU: {imu.problem}",
+        SensorCondition.WRONG_SETUP: "the set-up of the IMU is wrong",
+        SensorCondition.UNCONFIRMED: UNCONFIRMED,
+        SensorCondition.DISAGREES: "the IMU disagrees with the prisms",
+    }
+    return _finding(texts, imu_condition(imu))
+
+
+def _finding(texts: Mapping[SensorCondition, str], condition: SensorCondition) -> list[Finding]:
+    return [Finding(Level.CARE, texts[condition])] if condition in texts else []
 
 
 def imu_view(status: StatusRecord | None) -> dict[str, Any] | None:
@@ -298,13 +300,13 @@ def odometry_findings(status: StatusRecord | None) -> list[Finding]:
     odometry = status.odometry if status is not None else None
     if odometry is None:
         return []
-    if odometry.age_s is None or odometry.age_s > MAX_IMU_AGE_S:
-        return [Finding(Level.CARE, "the wheel odometry gives no samples")]
-    if odometry.problem:
-        return [Finding(Level.CARE, f"wheel odometry: {odometry.problem}")]
-    if odometry.use == "disagrees":
-        return [Finding(Level.CARE, "the wheel odometry disagrees with IMU and prisms")]
-    return []
+    texts = {
+        SensorCondition.NO_SAMPLES: "the wheel odometry gives no samples",
+        SensorCondition.SILENT: "the wheel odometry gives no samples",
+        SensorCondition.FAULTY: f"wheel odometry: {odometry.problem}",
+        SensorCondition.DISAGREES: "the wheel odometry disagrees with IMU and prisms",
+    }
+    return _finding(texts, odometry_condition(odometry))
 
 
 def odometry_view(status: StatusRecord | None) -> dict[str, Any] | None:
@@ -352,7 +354,7 @@ def storage_view(status: StatusRecord | None, setup: SetupRecord | None) -> dict
         else {
             "free_bytes": disk.free_bytes,
             "total_bytes": disk.total_bytes,
-            "bad": disk.free_bytes < LOW_DISK_BYTES,
+            "bad": disk_condition(disk) != DiskCondition.OK,
         },
     }
 
@@ -362,32 +364,27 @@ def storage_findings(status: StatusRecord | None) -> list[Finding]:
     if status is None:
         return []
     found = [] if status.recording is None else _recording_findings(status.stamp_ns, status.recording)
-    if status.disk is not None and status.disk.free_bytes < LOW_DISK_BYTES:
-        free = status.disk.free_bytes
-        full = free < FULL_DISK_BYTES
-        found.append(
-            Finding(
-                Level.CARE,
-                f"{DISK_FULL if full else 'the disk is nearly full'}: {free / 1e6:.0f} MB left",
-                urgent=full,
-            )
-        )
+    condition = disk_condition(status.disk)
+    if status.disk is not None and condition != DiskCondition.OK:
+        full = condition == DiskCondition.FULL
+        words = DISK_FULL if full else "the disk is nearly full"
+        found.append(Finding(Level.CARE, f"{words}: {status.disk.free_bytes / 1e6:.0f} MB left", urgent=full))
     return found
 
 
 def _recording_findings(now_ns: int, recording: RecordingStatus) -> list[Finding]:
     found = []
-    since_s = 0.0 if recording.last_write_ns is None else (now_ns - recording.last_write_ns) / 1e9
-    if since_s > MAX_WRITE_AGE_S:
-        found.append(Finding(Level.CARE, f"nothing has been recorded for {since_s:.0f} s", urgent=True))
-    elif recording.waiting_lines > MAX_WAITING_LINES:
-        found.append(
-            Finding(
-                Level.CARE,
-                f"the disk is slow: {recording.waiting_lines} lines wait to be recorded",
-                urgent=True,
+    match recording_condition(recording, now_ns):
+        case RecordingCondition.NOT_WRITTEN:
+            since = (
+                ""
+                if recording.last_write_ns is None
+                else f" for {(now_ns - recording.last_write_ns) / 1e9:.0f} s"
             )
-        )
+            found.append(Finding(Level.CARE, f"nothing has been recorded{since}", urgent=True))
+        case RecordingCondition.SLOW:
+            waiting = f"the disk is slow: {recording.waiting_lines} lines wait to be recorded"
+            found.append(Finding(Level.CARE, waiting, urgent=True))
     if recording.lost_lines:
         found.append(
             Finding(Level.CARE, f"{recording.lost_lines} lines of the recording are lost", urgent=True)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from tsgt.model import Status
+from tsgt.recording.conditions import StationCondition, station_condition
 from tsgt.web.frames import add, direction, rotate
 
 if TYPE_CHECKING:
     from tsgt.model import PolarMeasurement, Vector3
     from tsgt.recording import SetupStation, StationStatus
-
-MAX_AGE_S = 3.0
-"""A station whose last packet or measurement is older needs the operator; as `tsgt status` has it."""
 
 SIGHT_AGE_S = 3.0
 """A line of sight is drawn to where the station last measured its prism, this long."""
@@ -67,25 +65,27 @@ class Condition:
 
 def condition(station: StationStatus, elapsed_s: float, newest: Sight | None, now_s: float) -> Condition:
     """Return what a station does; ``elapsed_s``: age of its status."""
-    if station.last_heard_s is None:
-        return Condition("silent", "not received yet")
-    heard_s = station.last_heard_s + elapsed_s
-    if newest is not None:  # a measurement that came after the status
-        heard_s = min(heard_s, now_s - newest.measured_s)
-    if heard_s > MAX_AGE_S and (not station.answering or heard_s > 2 * MAX_AGE_S):
-        return Condition("silent", f"silent for {duration(heard_s)}")
-    status, age_s = station.status, station.age_s
-    if newest is not None and (age_s is None or now_s - newest.measured_s < age_s + elapsed_s):
-        status, age_s = newest.status, now_s - newest.measured_s
-    elif age_s is not None:
-        age_s += elapsed_s
-    if status is None or age_s is None:
-        return Condition("searching", "no measurement yet")
-    if not status.usable:
-        return Condition("searching", LABELS[status])
-    if age_s - heard_s > MAX_AGE_S:
-        return Condition("searching", f"no new measurement for {duration(age_s)}")
-    return Condition("tracking", LABELS[status])
+    if station.last_heard_s is not None:
+        heard_s, status = station.last_heard_s + elapsed_s, station.status
+        age_s = None if station.age_s is None else station.age_s + elapsed_s
+        if newest is not None:  # a measurement that came after the status
+            measured_s = now_s - newest.measured_s
+            heard_s = min(heard_s, measured_s)
+            if age_s is None or measured_s < age_s:
+                status, age_s = newest.status, measured_s
+        station = replace(station, last_heard_s=heard_s, age_s=age_s, status=status)
+    found = station_condition(station)
+    match found:
+        case StationCondition.NOT_RECEIVED:
+            return Condition("silent", "not received yet")
+        case StationCondition.SILENT:
+            return Condition("silent", f"silent for {duration(station.last_heard_s or 0.0)}")
+        case StationCondition.NO_MEASUREMENT:
+            return Condition("searching", "no measurement yet")
+        case StationCondition.NO_NEW_MEASUREMENT:
+            return Condition("searching", f"no new measurement for {duration(station.age_s or 0.0)}")
+    words = "" if station.status is None else LABELS[station.status]
+    return Condition("tracking" if found == StationCondition.TRACKING else "searching", words)
 
 
 def note(station: StationStatus) -> str:

@@ -47,7 +47,7 @@ def watch_of(status: StatusRecord = SOUND, pose: PoseRecord = LIVE) -> Watch:
         (SOUND, replace(LIVE, valid=False, reason="outage"), "NO POSE", "outage"),
         (SOUND, replace(LIVE, degraded_by=("prism_missing",)), "CARE", "prism missing"),
         (replace(SOUND, protocol="superframe", authenticated=False), LIVE, "CARE", "NO KEY"),
-        (replace(SOUND, disk=DiskStatus(free_bytes=9, total_bytes=99)), LIVE, "CARE", "nearly full"),
+        (replace(SOUND, disk=DiskStatus(free_bytes=9, total_bytes=99)), LIVE, "CARE", "the disk is full"),
         (
             replace(SOUND, stations=(replace(STATION, status=Status.TILT),)),
             LIVE,

@@ -50,7 +50,8 @@ def status(socket_path: Path | None, *, as_json: bool, watch: bool) -> int:
     events; it connects again when the daemon was restarted.
 
     Exit code 1: no daemon runs. 3: a daemon runs, but action is required: a station is not received or does not track,
-    the IMU gives no samples or disagrees with the prisms, the disk fails, or no pose is valid. With --watch always 0.
+    the IMU gives no samples, disagrees with the prisms or is not confirmed, the disk is full or fails, or no pose is
+    valid. With --watch always 0.
     """
     if watch:
         paths = [DEFAULT_SOCKET, DEFAULT_CLIENT_SOCKET] if socket_path is None else [socket_path]

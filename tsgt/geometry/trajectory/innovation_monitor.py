@@ -26,11 +26,13 @@ class InnovationMonitor:
     one of a single prism. ``inconsistent_prisms``: whose inconsistent measurements are not resolved yet. ``alone``: as many
     consistent measurements in succession of one prism resolve an ambiguity without other prisms. ``followed_for_s``: time from the
     first to the last inconsistent measurement of the newest ambiguity, once it is resolved and the trajectory has followed them.
+    After an outage the state may be ambiguous though all is consistent (:meth:`set_unproven`).
     """
 
     def __init__(self, alone: int | None = None) -> None:
         self._alone = alone
         self._succession = 0
+        self._needs_two_prisms = False
         self._consistent_prisms: frozenset[int] = frozenset()  # since the last inconsistent measurement
         self.inconsistent_prisms: frozenset[int] = frozenset()
         self._inconsistent_from_s = np.inf
@@ -70,6 +72,17 @@ class InnovationMonitor:
     def set_start(self, time_s: float) -> None:
         """Start the ambiguity after the measurements of the initialised trajectory."""
         self._inconsistent_from_s = time_s
+
+    def set_unproven(self, time_s: float, prisms: frozenset[int], *, needs_two_prisms: bool) -> None:
+        """Mark the state as ambiguous from a measurement on that a wrong prism could have given as well.
+
+        ``needs_two_prisms``: until two prisms agree, however often one does with itself.
+        """
+        if not self.inconsistent_prisms:
+            self._inconsistent_from_s = time_s
+        self.inconsistent_prisms |= prisms
+        self._consistent_prisms, self._succession = frozenset(), 0
+        self._needs_two_prisms = needs_two_prisms
 
     def select(self, rows: NDArray[np.bool_]) -> None:
         """Drop the other measurements of the window."""
@@ -116,9 +129,10 @@ class InnovationMonitor:
             else:
                 self._consistent_prisms |= {prism}
                 if len(self._consistent_prisms) > 1:
-                    self.inconsistent_prisms = frozenset()
+                    self.inconsistent_prisms, self._needs_two_prisms = frozenset(), False
             self._succession = 0 if is_flagged else self._succession + 1
-            if self._alone is not None and self._succession >= self._alone:
+            enough = np.inf if self._alone is None or self._needs_two_prisms else self._alone
+            if self._succession >= enough:
                 self.inconsistent_prisms = frozenset()
         # A flagged measurement that is no outlier has bent the trajectory: consistent innovations before it prove nothing.
         followed = frozenset(observations.prism[is_new & flagged & ~outliers].tolist())

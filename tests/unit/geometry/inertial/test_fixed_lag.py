@@ -251,6 +251,25 @@ def test_backlog_and_an_outage_at_once() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("stations", [3, 2])
+def test_measurement_after_an_outage_is_confirmed_by_another_prism(stations: int) -> None:
+    """A wrong one would have agreed as well."""
+    observations = measurements(stations)
+    live = Live()
+    live.measure(observations.select(observations.time_s < 5.0))
+    assert not live.window.ambiguous
+    later = np.flatnonzero(observations.time_s > 9.0)
+    first = later[observations.prism[later] == 0][:3]
+    for row in first:
+        live.measure(observations.select(slice(row, row + 1)))
+        assert live.window.ambiguous
+    row = int(np.flatnonzero((observations.prism == 1) & (np.arange(len(observations)) > first[-1]))[0])
+    live.measure(observations.select(slice(row, row + 1)))
+    assert live.window.converged
+    assert not live.window.ambiguous
+
+
+@pytest.mark.slow
 def test_no_start_from_one_prism_where_two_are_needed() -> None:
     """The second one ends the wait once it has been measured twice."""
     observations = measurements(2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tsgt.geometry.trajectory import Observations
-from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
+from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
 
 
 def _observations(*prisms: int) -> Observations:
@@ -90,3 +90,28 @@ def test_followed_measurements_that_have_left_the_window_count(for_s: float, *, 
     monitor = _monitor_after("AAAaaaaa", alone=5, followed=followed, window=4)
     assert not monitor.inconsistent_prisms
     assert monitor.followed_for_s == pytest.approx(for_s)
+
+
+@pytest.mark.parametrize(
+    ("text", "needs_two", "ambiguous"),
+    [
+        ("a", True, True),
+        ("aaaaaa", True, True),
+        ("aaAaaaaaa", True, True),
+        ("ab", True, False),
+        ("aaB", True, True),
+        ("aa", False, True),
+        ("aaa", False, False),
+    ],
+)
+def test_measurements_after_an_outage_are_unproven(text: str, *, needs_two: bool, ambiguous: bool) -> None:
+    """Until another prism agrees; where there is none, until a few agree."""
+    monitor = _monitor_after("ab", alone=3)
+    assert not monitor.inconsistent_prisms
+    monitor.set_unproven(5.0, frozenset({0}), needs_two_prisms=needs_two)
+    assert monitor.ambiguous_from_s == 5.0 - AMBIGUITY_MARGIN_S
+    for each in text:
+        wrong = np.array([each.isupper()])
+        monitor.select(np.zeros(len(monitor._time_s), np.bool_))
+        monitor.update(_observations("abc".index(each.lower())), np.ones(1, np.bool_), wrong, wrong)
+    assert bool(monitor.inconsistent_prisms) is ambiguous

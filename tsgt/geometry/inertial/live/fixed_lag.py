@@ -74,6 +74,8 @@ CONSISTENT_ALONE = 5
 """Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
 each of them. A chance agreement of wrong ones within the gate, five times, is none.
 """
+UNPROVEN_GAP_S, UNPROVEN_SIGMA_M = 1.0, 0.05
+"""Time without measurements, and sigma of the position after it, from which on a wrong prism, some decimetres away, may agree."""
 MAX_ROTATION_SQUARES = 20.0
 """Of the rotation of a start against that from before, normalised, three components; 2 in 10,000 exceed it."""
 WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
@@ -401,6 +403,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         assert self.observations is not None  # noqa: S101 (converged)
         if self._window.knots.time_s[0] - new.time_s[0] > 0.5 * MIN_KNOT_SPACING_S:
             return False  # in the first window, earlier than all others
+        self._check_proven(new)
         self._window = self._window_with(new.time_s)
         window, observations = self._window, self._mounted(self.observations)
         knot_index = nearest_knots(window.knots.time_s, observations.time_s)
@@ -463,6 +466,17 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._converged &= found.iterations < MAX_ITERATIONS
         self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
         return self._converged
+
+    def _check_proven(self, new: Observations) -> None:
+        """Have the measurements after an outage confirmed by another prism, where there is one."""
+        assert self._predictor is not None  # noqa: S101 (converged)
+        first_s = float(new.time_s[0])
+        if first_s - self._predictor.time_s < UNPROVEN_GAP_S:
+            return
+        _, covariance = self._predict(first_s, POSE_DIM)
+        if np.trace(covariance[0, :3, :3]) > UNPROVEN_SIGMA_M**2:
+            prisms = frozenset(new.prism.tolist())
+            self._monitor.set_unproven(first_s, prisms, needs_two_prisms=len(new.layout) > 1)
 
     def _window_with(self, time_s: FloatArray) -> KnotWindow:
         """Return the window with knots at measurement times that have none nearby, and with the samples that have arrived."""

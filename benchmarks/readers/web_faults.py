@@ -179,7 +179,7 @@ def faults(demo: Demo, radio: Cable, disk: Path) -> list[Fault]:
         ),
         Fault(
             "fence crossed", nothing, nothing, lambda line: event("geofence_exited")(line) and b"beyond its limit" in line,
-            "(CARE|NO POSE): .*\\boutside the geofence yard( |$)",
+            "(CARE|NO POSE): .*\\b(outside|beyond the limit of) the geofence yard( |$)",
         ),
     ]  # fmt: skip
 

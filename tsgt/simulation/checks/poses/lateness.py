@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 MAX_LATENESS_S = 0.0005
 """Limit beyond the error of the measurements' stamps. A single late station of three makes all prisms late by a third."""
 
+CHORD_S = 0.0025
+"""Added to the limit of interpolated poses: chords between the instants of the prisms turn the robot in curves, so that one prism is
+ahead of or behind the others. In the last 30 s of a mission one was 5.2 ms late, the others -0.5 and 1.6 ms (30988).
+"""
+
 SIGMAS = 4.0
 """Standard errors of the lateness that are added to the limit."""
 
@@ -71,10 +76,11 @@ def lateness_failures(
             velocity_mps = (transform_points(ahead, position_m) - true_m) / _STEP_S
             error_m = transform_points(estimated, position_m) - true_m + mean_s[:, None] * velocity_mps
             late = _lateness(at_s, error_m, velocity_mps)
-            if late is not None and abs(late[0]) > MAX_LATENESS_S + deviation_s + SIGMAS * late[1]:
+            limit_s = MAX_LATENESS_S + deviation_s + (CHORD_S if series == "interpolated" else 0.0)
+            if late is not None and abs(late[0]) > limit_s + SIGMAS * late[1]:
                 yield (
                     f"{len(at_s)} {series} poses: prism {prism} is {1e3 * late[0]:.2f} ms late, sigma {1e3 * late[1]:.2f} ms, "
-                    f"limit {1e3 * (MAX_LATENESS_S + deviation_s):.2f} ms and {SIGMAS:g} sigmas"
+                    f"limit {1e3 * limit_s:.2f} ms and {SIGMAS:g} sigmas"
                 )
 
 

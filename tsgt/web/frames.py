@@ -70,7 +70,9 @@ def worst_sigma(covariance: Sequence[float], first: int) -> float:
         covariance[6 * row + first : 6 * row + first + 3] for row in range(first, first + 3)
     )
     mean = (a + b + c) / 3
-    p = math.sqrt(((a - mean) ** 2 + (b - mean) ** 2 + (c - mean) ** 2 + 2 * (d * d + e * e + f * f)) / 6)
+    # Products of absurd numbers are infinite; their powers would raise.
+    squares = sum((each - mean) * (each - mean) for each in (a, b, c))
+    p = math.sqrt((squares + 2 * (d * d + e * e + f * f)) / 6)
     if p == 0.0:
         return math.sqrt(max(mean, 0.0))
     a, b, c, d, e, f = ((a - mean) / p, (b - mean) / p, (c - mean) / p, d / p, e / p, f / p)

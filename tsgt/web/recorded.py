@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 import bisect
+import contextlib
 import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, BinaryIO
 
 from tsgt.errors import RecordingError
-from tsgt.model import Parameters
-from tsgt.recording import (
-    MAX_LINE_BYTES,
-    SETUP_START,
-    EventRecord,
-    SetupRecord,
-    decode,
-    encode_line,
-    read_lines,
-)
+from tsgt.recording import MAX_LINE_BYTES, SETUP_START, EventRecord, decode, read_lines
 from tsgt.recording.format import HEADER_START
 from tsgt.web.mission.findings import kind
 
@@ -27,7 +19,7 @@ if TYPE_CHECKING:
 
 _RECEIVED = re.compile(rb'"received_ns":(\d{1,19})')
 _STAMP = re.compile(rb'"stamp_ns":(\d{1,19})')
-_PARAMETERS_START = b'{"type":"parameters",'
+PARAMETERS_START = b'{"type":"parameters",'
 _EVENT_START = b'{"type":"event",'
 _POSE_START = b'{"type":"pose",'
 _PREDICTED = b'"kind":"predicted"'
@@ -71,7 +63,8 @@ class Timeline:
             self.unix_ns = at_ns
             self.at_s = max(self.at_s, self.session_s + (at_ns - self.session_ns) / 1e9)
         elif line.startswith(HEADER_START) and self.session_ns is not None:
-            self.session_s, self.session_ns = self.at_s + BETWEEN_SESSIONS_S, None
+            self.at_s += BETWEEN_SESSIONS_S
+            self.session_s, self.session_ns = self.at_s, None
         return self.at_s
 
 
@@ -79,12 +72,13 @@ class Timeline:
 class RecordingIndex:
     """Index of a recording.
 
-    ``setups``, ``events``: lines that hold until later ones, with their times.
+    ``lasting``: lines that hold until later ones: headers, set-ups and events, with their times. ``marks``: time and kind
+    of each event, for the time bar.
     """
 
     path: Path
-    setups: list[tuple[float, bytes]] = field(default_factory=list)
-    events: list[tuple[float, bytes]] = field(default_factory=list)
+    lasting: list[tuple[float, bytes]] = field(default_factory=list)
+    marks: list[tuple[float, str]] = field(default_factory=list)
     start_ns: int | None = None
     length_s: float = 0.0
     poses: int = 0
@@ -109,25 +103,21 @@ class RecordingIndex:
         with self.path.open("rb") as file:
             file.seek(offset)
             while line := file.readline(MAX_LINE_BYTES):
-                yield timeline.advance(line), line
-
-    def marks(self) -> list[tuple[float, str]]:
-        """Return time and kind of each event, for the time bar."""
-        return [(round(at_s, 1), kind(decode(EventRecord, line).event)) for at_s, line in self.events]
+                at_s = timeline.advance(line)
+                if line.endswith(b"\n"):  # else it is torn, as the last one after a power cut
+                    yield at_s, line
 
     def _add(self, line: bytes, at_s: float, unix_ns: int | None) -> None:
         if self.start_ns is None:
             self.start_ns = unix_ns
         if line.startswith(_POSE_START):
             self.poses += 1
-        elif line.startswith(SETUP_START):
-            self.setups.append((at_s, line))
-        elif line.startswith(_PARAMETERS_START):
-            # A session of an older version has no set-up; one that follows replaces this.
-            setup = SetupRecord.of(decode(Parameters, line), unix_ns or 0)
-            self.setups.append((at_s, encode_line(setup)))
-        elif line.startswith(_EVENT_START) and len(self.events) < MAX_EVENTS:
-            self.events.append((at_s, line))
+        elif line.startswith((HEADER_START, SETUP_START, PARAMETERS_START)):
+            self.lasting.append((at_s, line))
+        elif line.startswith(_EVENT_START) and len(self.marks) < MAX_EVENTS:
+            with contextlib.suppress(ValueError):  # torn
+                self.marks.append((round(at_s, 1), kind(decode(EventRecord, line).event)))
+                self.lasting.append((at_s, line))
 
 
 def index_of(path: Path) -> RecordingIndex:

@@ -7,9 +7,13 @@ import contextlib
 import math
 from typing import TYPE_CHECKING, Any
 
+from tsgt.model import Parameters
+from tsgt.recording import SetupRecord, decode, encode_line
+from tsgt.recording.format import HEADER_START
 from tsgt.web.live import INTERVAL_S
 from tsgt.web.messages import encode, message
 from tsgt.web.mission import MissionState
+from tsgt.web.recorded import PARAMETERS_START
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Iterator, Mapping
@@ -54,7 +58,7 @@ class ReplayMessages:
                 bar |= {
                     "length_s": round(length_s, 1),
                     "start_ms": (self._index.start_ns or 0) // 1_000_000,
-                    "marks": self._index.marks()[-500:],
+                    "marks": self._index.marks[-500:],
                 }
             yield encode(message(state, state.view(at_s), cursors, now_s, replay=bar))
             cursors = state.cursors()
@@ -69,12 +73,9 @@ class _Player:
         self.state = MissionState(index.path.name)
         from_s = max(0.0, at_s - BEFORE_S)
         self.state.connected(from_s)
-        for earlier in (index.setups, index.events):
-            for line_s, line in earlier:
-                if line_s < from_s or (earlier is index.setups and line_s <= from_s):
-                    self.state.line(line, from_s)
-        self._setups = iter([each for each in index.setups if each[0] > from_s])
-        self._next_setup = next(self._setups, None)
+        for line_s, line in index.lasting:
+            if line_s < from_s:
+                self._take(from_s, line)
         self._lines: Iterator[tuple[float, bytes]] = index.lines(from_s)
         self._next = next(self._lines, None)
         self._from_s = from_s
@@ -84,9 +85,6 @@ class _Player:
         lines = 0
         while self._next is not None and self._next[0] <= at_s:
             line_s, line = self._next
-            while self._next_setup is not None and self._next_setup[0] <= line_s:
-                self._take(*self._next_setup)
-                self._next_setup = next(self._setups, None)
             # The place in the index may be a little earlier; what is there was passed on above.
             if line_s >= self._from_s:
                 self._take(line_s, line)
@@ -96,8 +94,13 @@ class _Player:
                 await asyncio.sleep(0)
 
     def _take(self, line_s: float, line: bytes) -> None:
-        # A torn line, as at the end of a master that was killed.
-        with contextlib.suppress(ValueError):
+        if line.startswith(HEADER_START):  # another run of the master, perhaps with another clock
+            self.state.connected(line_s)
+            return
+        with contextlib.suppress(ValueError):  # of another version
+            if line.startswith(PARAMETERS_START):
+                # A session of an older version has no set-up; one that follows replaces this.
+                line = encode_line(SetupRecord.of(decode(Parameters, line), 0))
             self.state.line(line, line_s)
 
 

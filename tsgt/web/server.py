@@ -276,12 +276,14 @@ class Page:
         _protect(response)
         _limit_buffers(request.transport)
         await response.prepare(request)
-        with suppress(ConnectionError):
-            async with aclosing(self.messages.messages(request.query)) as messages:
-                if not await self._send(request, response, messages):
-                    log.warning("web_reader_stalled", address=request.remote)
-        if request.transport is not None:
-            request.transport.abort()
+        try:
+            with suppress(ConnectionError):
+                async with aclosing(self.messages.messages(request.query)) as messages:
+                    if not await self._send(request, response, messages):
+                        log.warning("web_reader_stalled", address=request.remote)
+        finally:  # also after a defect: else the browser would wait on this connection
+            if request.transport is not None:
+                request.transport.abort()
         return response
 
     async def _send(

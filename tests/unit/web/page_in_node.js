@@ -8,7 +8,11 @@ const page = readFileSync(file, "utf8").replace(/^import .*$/gm, "");
 
 // Everything that an element has is another element, and every call returns one.
 function element() {
-  const own = { dataset: {}, children: [], textContent: "", clientWidth: 100, [Symbol.toPrimitive]: () => "" };
+  const selected = {};
+  const own = {
+    dataset: {}, children: [], textContent: "", clientWidth: 100, [Symbol.toPrimitive]: () => "",
+    querySelector: (selector) => selected[selector] ??= element(),
+  };
   return new Proxy(function () {}, {
     get: (_, name) => name in own ? own[name] : name === "querySelectorAll" ? () => [element(), element()] : element(),
     apply: () => element(),
@@ -36,10 +40,10 @@ const EventSource = class {
 };
 
 const timers = [];
-const MissionMap = class { constructor() { this.trail = []; } update() {} draw() {} };
+const MissionMap = class { constructor() { this.trail = []; this.last = null; } update() {} draw() {} };
 const names = ["document", "window", "MissionMap", "drawChart", "EventSource", "performance", "Date", "setInterval", "fetch", "location", "localStorage"];
 const storage = { getItem: () => null, setItem: () => {} };
-const { verdict } = new Function(...names, `${page}\nreturn { verdict };`)(
+const { verdict, map, events } = new Function(...names, `${page}\nreturn { verdict, map, events: () => events };`)(
   document, element(), MissionMap, () => [], EventSource, performance, Clock, (timer) => timers.push(timer), () => Promise.resolve({}), {}, storage);
 
 const nothing = { first: 0, items: [] };
@@ -50,14 +54,17 @@ const view = {
 
 const robot = { ahead_s: 1000 }; // its clock, which stands still while it is suspended, beyond the page's steady one
 
+const content = {}; // of the messages to come, beside the view
+
 const scenes = {
-  connections, robot,
+  connections, robot, view, content, map, events,
+  textOf: (id, selector) => elements[id].querySelector(selector).textContent,
   words: () => verdict().words,
   // Let time pass, without the page's timers; the steady clock stands still in sleep.
   pass: (ms, steady_ms = ms) => { time.wall_ms += ms; time.steady_ms += steady_ms; },
   timers: () => { for (const timer of timers) timer(); },
   sent_s: () => time.steady_ms / 1000 + robot.ahead_s,
-  text: (sent_s, first = false) => JSON.stringify({ first, sent_s, view, trail: nothing, residuals: nothing, events: nothing }),
+  text: (sent_s, first = false) => JSON.stringify({ first, sent_s, view, trail: nothing, residuals: nothing, events: nothing, ...content }),
   // Hand a message to the newest connection.
   message: (sent_s = scenes.sent_s()) => {
     const source = connections.at(-1);

@@ -175,6 +175,25 @@ def test_pose_of_a_late_stream_is_no_pose() -> None:
     assert sent(12.0, 12.0) == ["/tsgt/pose", "/tf", "/tsgt/scene"]
 
 
+def test_last_known_position_is_not_shown_in_a_new_frame() -> None:
+    """It was one of the old frame, as was the trail."""
+    state = MissionState("poses.sock")
+    feed = Feed(state, lambda _: True)
+    state.connected(0.0)
+    other = replace(
+        SETUP, stations=tuple(replace(each, position_m=(9.0, 9.0, 0.0)) for each in SETUP.stations)
+    )
+    shown = []
+    for setup in (SETUP, SETUP, other):
+        for record in (setup, status(0.0), pose(0.0)) if setup is SETUP else (setup,):
+            line = encode_line(record)
+            state.line(line, 0.0)
+            list(feed.line(line, 0.0))
+        scenes = [each.data for each in feed.view(state.view(1.2), 1.2) if each.topic == "/tsgt/scene"]
+        shown.append(any(b"last known position" in each for each in scenes))
+    assert shown == [True, True, False]
+
+
 def said(feed: Feed, state: MissionState, now_s: float) -> dict[str, Any]:
     """Return what the channel of the mission says."""
     messages = {each.topic: each.data for each in feed.view(state.view(now_s), now_s)}

@@ -101,6 +101,49 @@ def test_page_follows_a_robot_that_was_restarted() -> None:
     assert set(shown) == {"GOOD"}
 
 
+def test_item_that_comes_twice_is_listed_once() -> None:
+    """A page that has just connected gets the newest ones with its first message, and again with the next."""
+    assert run("""
+        const events_from = (first, ...texts) => {
+            content.events = { first, items: texts.map((text) => ({ text, stamp_ms: 0 })) };
+            message();
+        };
+        events_from(7, "a", "b");
+        events_from(8, "b", "c");
+        events_from(10, "d");
+        return events().map(({ text }) => text);
+    """) == ["a", "b", "c", "d"]
+
+
+def test_new_frame_empties_the_map() -> None:
+    """The trail begins anew behind a gap, and there is no last known position; the same set-up changes nothing."""
+    assert run("""
+        const shown = () => [map.trail.map(([x]) => x), map.last];
+        const found = [];
+        content.setup = { stations: [{ id: 2, at: [0, 10] }] };
+        content.trail = { first: 0, items: [[1], [2]] };
+        message();
+        map.last = "here";
+        content.trail = { first: 2, items: [[3]] };
+        message();
+        found.push(shown());
+        content.setup = { stations: [{ id: 2, at: [30, 10] }] };
+        content.trail = { first: 4, items: [[9]] };
+        message();
+        found.push(shown());
+        return found;
+    """) == [[[1, 2, 3], "here"], [[9], None]]
+
+
+def test_share_of_a_minute_and_counts_of_the_mission_are_told_apart() -> None:
+    """And a share below one is never 100 %."""
+    assert run("""
+        view.figures = { valid_share: 0.999, poses: 1472, valid_poses: 287 };
+        message();
+        return [textOf("f-valid", "b"), textOf("f-valid", ".small")];
+    """) == ["99.9 %", "last minute; 287 of 1472 since the start"]
+
+
 def test_late_messages_are_no_connection() -> None:
     """On no connection, and a new one is tried every four seconds at most."""
     shown, count = run("""

@@ -10,7 +10,7 @@ from harness.files.records import EVENT, HEADER, PARAMETERS, SETUP, START
 from harness.readers.web import pose, status
 
 from tsgt.errors import RecordingError
-from tsgt.recording import encode_line
+from tsgt.recording import SetupRecord, encode_line
 from tsgt.simulation.kernel import VirtualClock
 from tsgt.web.recorded import RecordingIndex, index_of
 from tsgt.web.replay import ReplayMessages
@@ -103,6 +103,51 @@ async def test_sessions_follow_one_another(index: RecordingIndex) -> None:
     with index.path.open("ab") as file:
         file.write(b"\n" + b"".join(encode_line(record) + b"\n" for record in earlier))
     assert index_of(index.path).length_s == pytest.approx(60.0 + 2.0 + 9.0)
+
+
+FAILED = [
+    replace(EVENT, event="radio_failed", message="the radio of the master failed", stamp_ns=START + 9 * 10**9),
+    replace(EVENT, event="geofence_exited", message="geofence site exited: no valid pose for 2 s", stamp_ns=START + 9 * 10**9),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("setup", [[], [SETUP]], ids=["old version", "with set-up"])
+@pytest.mark.parametrize("at_s", ["5", "330"])
+@pytest.mark.parametrize("begin_s", [3600, -60])
+async def test_second_run_knows_nothing_of_the_first(
+    tmp_path: Path, begin_s: int, at_s: str, setup: list[SetupRecord]
+) -> None:
+    """Neither its alarms nor its clock, which was set back meanwhile; whether its end is played or only read."""
+    records: list[object] = []
+    for start_s, length_s, events in ((0, 10, FAILED), (begin_s, 400, [])):
+        own = [replace(each, stamp_ns=START + start_s * 10**9) for each in setup]
+        records += [HEADER, PARAMETERS, *own]
+        for second in range(start_s, start_s + length_s):
+            records += [status(second), pose(second)]
+        records += events
+    path = tmp_path / "runs.jsonl"
+    path.write_bytes(b"".join(encode_line(record) + b"\n" for record in records))
+    found = await messages(index_of(path), 10, at=at_s, speed="10")
+    assert found[-1]["replay"]["at_s"] == pytest.approx(float(at_s) + 18.0)
+    view = found[-1]["view"]
+    assert (view["verdict"]["words"], view["alarms"]) == ("GOOD", [])
+    assert {each["state"] for each in view["stations"]} == {"tracking"}
+    assert [each["setup"] for each in found if "setup" in each][-1]["stations"]
+    told = [item["event"] for each in found for item in each["events"]["items"]]
+    assert told == ["radio_failed", "geofence_exited"]
+
+
+@pytest.mark.parametrize("torn", [EVENT, PARAMETERS, SETUP, pose(61)])
+@pytest.mark.parametrize("end", [b"", b"\n"])
+async def test_torn_last_line_is_left_out(index: RecordingIndex, torn: object, end: bytes) -> None:
+    """After a power cut, whatever its type: the rest is shown, to its end."""
+    whole = index.path.read_bytes().rpartition(b"\n")[0] + b"\n"
+    index.path.write_bytes(whole + encode_line(torn)[:60] + end)
+    (first,) = await messages(index_of(index.path), 1, at="60")
+    assert x_m(first) == 60.0
+    assert first["replay"]["marks"] == [[30.0, "alarm"]]
+    if not end:
+        assert "cannot be read" not in json.dumps(first["view"])
 
 
 async def test_old_recording_has_the_set_up_of_its_parameters(tmp_path: Path) -> None:

@@ -394,6 +394,22 @@ async def test_stalled_reader_is_disconnected_and_costs_the_others_nothing(
 
 
 @in_real_time
+async def test_defect_closes_the_connection_of_its_reader(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The browser then connects again, instead of waiting for ever."""
+    state = mission()
+
+    def fail(_now_s: float) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(state, "view", fail)
+    with capture_logs() as logged:
+        async with served(state) as url, asyncio.timeout(5):
+            answer = await raw(url, f"GET /stream HTTP/1.1\r\nHost: {host(url)}\r\n\r\n".encode())
+    assert b" 500 " not in answer  # a second answer within the first one
+    assert "web_request_failed" in {each["event"] for each in logged}
+
+
+@in_real_time
 async def test_readers_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     """Further ones are refused, and have room when another has left."""
     monkeypatch.setattr(server, "MAX_READERS", 1)

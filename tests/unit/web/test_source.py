@@ -77,12 +77,12 @@ async def test_master_that_comes_later_is_found(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.slow
 @in_real_time
 async def test_line_of_a_newer_master_is_skipped(tmp_path: Path) -> None:
-    """With a value that this program does not know; the log says so once."""
+    """With a value that this program does not know; the page says so, and the log once."""
     newer = STATUS_LINE.replace(b'"status":"ok"', b'"status":"levitating"')
     path = tmp_path / "s"
     with capture_logs() as logged:
         async with master(path, *LINES, newer, b"{"), following(path) as state:
-            await shown(state, "GOOD")
+            await shown(state, "CARE", "status lines cannot be read: restart or update tsgt web")
     assert [each["event"] for each in logged].count("stream_line_rejected") == 1
 
 

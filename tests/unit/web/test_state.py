@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -18,9 +19,9 @@ LEFT = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 """A quarter turn about the z axis."""
 
 
-def event(name: str, message: str) -> EventRecord:
+def event(name: str, message: str, at_s: float = 0.0) -> EventRecord:
     """Return an event."""
-    return EventRecord(stamp_ns=START, event=name, message=message)
+    return EventRecord(stamp_ns=START + round(at_s * 1e9), event=name, message=message)
 
 
 def verdict(state: MissionState, now_s: float) -> tuple[str, str]:
@@ -120,7 +121,7 @@ def test_failed_radio_is_the_cause_of_silent_stations() -> None:
     failure = "the radio of the master failed, no station can be reached: SPI timeout"
     silent = [station(number, last_heard_s=6.0, answering=False) for number in (1, 2, 3)]
     lost = pose(10.0, valid=False, reason="outage", quality="invalid")
-    feed(state, event("radio_failed", failure), status(10.0), now_s=10.0)
+    feed(state, event("radio_failed", failure, 10.0), status(10.0), now_s=10.0)
     assert {each["state"] for each in state.view(10.0)["stations"]} == {"silent"}
     feed(state, status(10.0, *silent), lost, now_s=10.0)
     assert verdict(state, 10.1) == ("NO POSE", failure)
@@ -301,6 +302,106 @@ def test_line_that_is_no_pose_leaves_the_pose_before() -> None:
     state = running()
     state.line(b'{"type":"pose","valid":true}\n', 10.01)
     assert state.view(10.02)["pose"]["at"][0] == 10.0
+
+
+NEWER = "restart or update tsgt web"
+
+
+def newer_pose(at_s: float) -> bytes:
+    """Return the line of a valid pose with a value that this program does not know."""
+    line = encode_line(pose(at_s, quality="degraded", degraded_by=("residual",)))
+    return line.replace(b'"residual"]', b'"wheel_slip"]')
+
+
+def test_unreadable_poses_are_no_poses() -> None:
+    """Although they come, and say that they are valid: the pose shown ages, and the cause is named."""
+    state = running()
+    for i in range(1, 41):
+        at_s = 10 + i / 20
+        if i % 20 == 0:
+            feed(state, status(at_s), now_s=at_s)
+        with suppress(ValueError):
+            state.line(newer_pose(at_s), at_s)
+        view = state.view(at_s)
+        assert view["pose"]["age_s"] == pytest.approx(i / 20)
+    assert not view["pose"]["valid"]
+    assert view["figures"]["live"] is None
+    assert verdict(state, 12.0) == ("NO POSE", f"no pose for 2 s: pose lines cannot be read: {NEWER}")
+    assert view["alarms"] == []
+    assert view["figures"]["valid_share"] < 0.1
+
+
+def test_old_status_is_a_finding() -> None:
+    """What it says of stations and disk is not of now; why it is old is told where that is known."""
+    state = running()
+    for second in range(11, 14):
+        feed(state, pose(second), now_s=second)
+    assert verdict(state, 13.0)[0] == "GOOD"
+    feed(state, pose(14.0), now_s=14.0)
+    assert verdict(state, 14.0) == ("CARE", "no status of the master for 4 s")
+    newer = encode_line(status(14.0)).replace(b'"status":"ok"', b'"status":"levitating"')
+    with pytest.raises(ValueError, match="status"):
+        state.line(newer, 14.0)
+    assert verdict(state, 14.0) == ("CARE", f"status lines cannot be read: {NEWER}")
+    assert [each["text"] for each in state.view(14.0)["alarms"]] == ["no status of the master for 4 s"]
+    feed(state, status(17.5), pose(17.5), now_s=17.5)
+    state.view(17.5)
+    feed(state, pose(18.6), now_s=18.6)
+    assert verdict(state, 18.6)[0] == "GOOD"
+
+
+def moved(setup: SetupRecord) -> SetupRecord:
+    """Return a set-up in which station 1, which defines the frame, stands 30 m away."""
+    stations = tuple(
+        replace(each, position_m=(-30.0, 0.0, 0.0)) if each.id > 1 else each for each in setup.stations
+    )
+    return replace(setup, stations=stations)
+
+
+def test_nothing_of_the_old_frame_is_shown_in_a_new_one() -> None:
+    """Neither trail nor pose nor sight line; a reader that has the old trail starts anew."""
+    state = running()
+    feed(state, replace(measurement(0), zenith_angle_rad=math.pi / 2), now_s=10.0)
+    cursors = state.cursors()
+    feed(state, moved(SETUP), now_s=10.01)
+    view = state.view(10.02)
+    assert (view["pose"], view["stations"][0]["sight"], state.trail.since(0)["items"]) == (None, None, [])
+    feed(state, pose(10.05, position_m=(-20.0, 10.0, 0.0)), now_s=10.05)
+    then = message(state, {}, cursors, 10.1)["trail"]
+    assert then["items"] == [[-20.0, 10.0, 0.0]]
+    assert then["first"] > cursors.trail
+
+
+def test_trail_stays_with_the_same_frames() -> None:
+    """The set-up is sent again to a reader that has lost lines, or with other prisms; a connection made anew interrupts the trail."""
+    state = running()
+    feed(state, replace(SETUP, prisms=SETUP.prisms[:2]), now_s=10.1)
+    assert state.view(10.2)["pose"] is not None
+    state.connected(11.0)
+    feed(state, SETUP, pose(11.0), now_s=11.0)
+    assert state.trail.since(0)["items"] == [[10.0, 10.0, 0.0], None, [10.0, 10.0, 0.0]]
+    state.connected(12.0)
+    feed(state, moved(SETUP), pose(12.0), now_s=12.0)
+    assert state.trail.since(0)["items"] == [[10.0, 10.0, 0.0]]
+
+
+def test_share_of_valid_poses_is_rounded_down() -> None:
+    """One invalid pose in a minute is not 100 %."""
+    state = mission()
+    for i in range(3000):
+        feed(state, pose(i / 50, **({"valid": False, "reason": "tilt"} if i == 1500 else {})), now_s=i / 50)
+    feed(state, status(60.0), now_s=60.0)
+    assert state.view(60.0)["figures"]["valid_share"] == 0.999
+
+
+def test_absurd_numbers_do_not_end_the_page() -> None:
+    """Of a covariance, or of the corners of a fence: what has no finite value is not shown."""
+    state = running()
+    feed(state, pose(10.1, covariance=(1e200,) + (0.0,) * 35, degraded_by=("uncertain",)), now_s=10.1)
+    assert state.view(10.2)["figures"]["live"] == {"position_mm": None, "rotation_deg": 0.0}
+    far = replace(SETUP.geofences[0], polygon_m=((0.0, 0.0), (1e200, 0.0), (0.0, 1e200)))
+    feed(state, replace(SETUP, geofences=(far,)), pose(10.3), now_s=10.3)
+    assert state.view(10.4)["verdict"]["words"] == "CARE"  # held
 
 
 def test_other_protocol_is_refused() -> None:

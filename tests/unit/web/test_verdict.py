@@ -33,6 +33,16 @@ def test_verdict_is_the_worst_with_its_cause(
     assert (first.level.words, first.cause) == (words, cause)
 
 
+def test_text_that_begins_another_one_is_no_repetition() -> None:
+    """Two geofences with names that begin alike are two findings; the same finding with more detail is one."""
+    pit, road, full = (
+        Finding(Level.CARE, text)
+        for text in ("outside the geofence pit", "outside the geofence pit road", "the disk is full")
+    )
+    left = Finding(Level.CARE, "the disk is full: 3 MB left")
+    assert judge(LIVE, VALID, "w", [pit, full, road, left]) == [pit, road, left]
+
+
 def test_nothing_else_is_claimed_without_a_stream() -> None:
     """A station's state of ten seconds ago is not an alarm of now."""
     assert len(judge(StreamFacts(connected=False, problem="p"), VALID, "w", [FENCE, STATION])) == 1

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 TRAIL_INTERVAL_S = 1.0
 
 _POSE, _STATUS, _EVENT = b'{"type":"pose"', b'{"type":"status"', b'{"type":"event"'
+_SETUP = b'{"type":"setup"'
 _SMOOTHED = b'"kind":"smoothed"'
 
 
@@ -53,6 +54,7 @@ class Feed:
         self._stamp_ns: int | None = None
         self._stamp_s = 0.0
         self._last: Vector3 | None = None
+        self._frames: Any = None
         self._trail_s = -math.inf
 
     def now_ns(self, now_s: float) -> int | None:
@@ -71,6 +73,8 @@ class Feed:
         elif data.startswith(_STATUS):
             self._stamp_ns, self._stamp_s = decode(StatusRecord, data).stamp_ns, now_s
             yield Message(channels.STATUS, self._stamp_ns, data.strip())
+        elif data.startswith(_SETUP) and self._state.frames != self._frames:
+            self._frames, self._last = self._state.frames, None
         elif data.startswith(_EVENT) and self._wanted(channels.EVENTS):
             event = decode(EventRecord, data)
             yield Message(channels.EVENTS, self.now_ns(now_s) or event.stamp_ns, messages.log_line(event))

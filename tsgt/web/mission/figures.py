@@ -38,7 +38,7 @@ def figures(
         "smoothed_rotation_limit_deg": None if limits is None else _deg(limits.rotation_sigma_rad),
         "residual_mm": None if fresh is None else _mm(fresh.residual_m),
         "residual_limit_mm": None if limits is None else _mm(limits.residual_m),
-        "valid_share": rounded(share, 3),
+        "valid_share": None if share is None else math.floor(1000 * share) / 1000,  # 100 %: none is invalid
         "poses": status.poses if status is not None else None,
         "valid_poses": status.valid_poses if status is not None else None,
         "data_age_s": rounded(min(ages) + elapsed_s, 2) if ages else None,

@@ -20,7 +20,7 @@ from tsgt.web.frames import worst_sigma
 from tsgt.web.mission.verdict import Finding, Level
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from tsgt.recording import (
         EventRecord,
@@ -44,11 +44,14 @@ ALARMS = frozenset(
 _END = {
     "radio_failed": {"radio_recovered"},
     "layout_residual_high": {"layout_residual_normal", "setup_applied"},
-    "imu_setup_wrong": {"imu_setup_confirmed"},
+    "imu_setup_wrong": {"imu_setup_confirmed", "setup_applied"},
     "disk_full": {"disk_low", "disk_failed", "disk_recovered"},
     "disk_failed": {"disk_low", "disk_full", "disk_recovered"},
 }
 """Events that begin a lasting state that no status tells, or tells later, each with those that end it."""
+
+_ONLY_EVENTS_TELL = frozenset({"layout_residual_high"})
+"""The other lasting states, and those of geofences, follow from status and poses as well, roughly."""
 
 _URGENT = frozenset({"radio_failed", "disk_full", "disk_failed"})
 
@@ -61,6 +64,12 @@ _GOOD_NEWS = frozenset(
 )  # fmt: skip
 
 _FENCE = re.compile(r"geofence (.*?) (?:exited|entered)(: no valid pose)?")
+
+STATUS_AGE_LIMIT_S = 3.0
+"""A master sends a status each second."""
+
+FENCE_HYSTERESIS_M = 0.1
+"""A robot that is parked at a fence does not change the verdict by the noise of its poses."""
 
 UNCONFIRMED = "the set-up of the IMU is not confirmed yet: drive curves, accelerate and brake"
 """The operator has to act: without that poses do without the IMU, or rest on one that may be set up wrongly."""
@@ -81,23 +90,36 @@ class StandingEvents:
     def __init__(self) -> None:
         self._messages: dict[str, str] = {}
         self._fences: dict[str, str] = {}
+        self._radio_failed_ns = 0
 
     def take(self, event: EventRecord) -> None:
         """Take an event."""
-        if (fence := _FENCE.match(event.message)) and event.event.startswith("geofence_"):
+        if event.event == "lines_lost":  # perhaps those that ended them
+            self._fences.clear()
+            for name in self._messages.keys() - _ONLY_EVENTS_TELL:
+                del self._messages[name]
+        elif (fence := _FENCE.match(event.message)) and event.event.startswith("geofence_"):
             if event.event == "geofence_exited":
-                where = "perhaps outside" if fence[2] else "outside"
+                # The limit: the boundary less margin and uncertainty. The robot may be inside.
+                where = "perhaps outside" if fence[2] else "beyond the limit of"
                 self._fences[fence[1]] = f"{where} the geofence {fence[1]}{fence[2] or ''}"
             else:
                 self._fences.pop(fence[1], None)
         elif event.event in _END:
             self._messages[event.event] = DISK_FULL if event.event == "disk_full" else event.message
+            if event.event == "radio_failed":
+                self._radio_failed_ns = event.stamp_ns
         for begin, ends in _END.items():
             if event.event in ends:
                 self._messages.pop(begin, None)
 
+    def received(self, at_ns: int) -> None:
+        """Take note that a station was received at a time on the master's Unix clock: the radio works."""
+        if at_ns > self._radio_failed_ns:
+            self._messages.pop("radio_failed", None)
+
     def fences(self) -> list[Finding]:
-        """Return the geofences that the robot has left, or may have left."""
+        """Return the geofences whose limit the robot has crossed, or may have crossed."""
         return [Finding(Level.CARE, text, urgent=True) for text in self._fences.values()]
 
     @property
@@ -234,21 +256,59 @@ def _stations_in_words(conditions: Mapping[int, Condition]) -> list[str]:
     ]
 
 
+class FenceMonitor:
+    """Which geofences the robot is outside of, or close to, with a hysteresis."""
+
+    def __init__(self) -> None:
+        self._outside: set[str] = set()
+        self._close: set[str] = set()
+
+    def findings(self, setup: SetupRecord | None, position: tuple[float, float] | None) -> list[Finding]:
+        """Return the findings at a position; None: there is no valid pose."""
+        if setup is None or position is None:
+            return []
+        found = []
+        for fence in setup.geofences:
+            name = fence.name
+            try:
+                distance_m = min(distance_to_edge(position, edge)[0] for edge in edges(fence.polygon_m))
+                allowed = contains(fence.polygon_m, position) == (fence.allowed_side == "inside")
+            except ArithmeticError:  # a polygon that no master has accepted
+                continue
+            inside_m = distance_m if allowed else -distance_m
+            outside = _below(inside_m, 0.0, name, self._outside)
+            close = _below(inside_m, fence.margin_m, name, self._close)
+            if outside:
+                found.append(Finding(Level.CARE, f"outside the geofence {name}", urgent=True))
+            elif close:
+                text = f"{distance_m:.1f} m from the boundary of the geofence {name}"
+                found.append(Finding(Level.CARE, text))
+        return found
+
+
+def _below(value_m: float, limit_m: float, name: str, below: set[str]) -> bool:
+    """Return whether a value is below its limit, which is higher for a name that was below; keep the name if it is."""
+    is_below = value_m < limit_m + (FENCE_HYSTERESIS_M if name in below else 0.0)
+    (below.add if is_below else below.discard)(name)
+    return is_below
+
+
 def fence_findings(setup: SetupRecord | None, position: tuple[float, float] | None) -> list[Finding]:
     """Return the geofences that the robot is outside of, also if it left them before this program started."""
-    if setup is None or position is None:
-        return []
-    found = []
-    for fence in setup.geofences:
-        allowed = contains(fence.polygon_m, position) == (fence.allowed_side == "inside")
-        near_m = min(distance_to_edge(position, edge)[0] for edge in edges(fence.polygon_m))
-        if not allowed:
-            found.append(Finding(Level.CARE, f"outside the geofence {fence.name}", urgent=True))
-        elif near_m < fence.margin_m:
-            found.append(
-                Finding(Level.CARE, f"{near_m:.1f} m from the boundary of the geofence {fence.name}")
-            )
-    return found
+    return FenceMonitor().findings(setup, position)
+
+
+def unreadable_lines(name: str) -> str:
+    """Return that lines of a type cannot be read: the master is newer, and this program was not restarted with it."""
+    return f"{name} lines cannot be read: restart or update tsgt web"
+
+
+def line_findings(unreadable: Sequence[str], status_age_s: float | None) -> list[Finding]:
+    """Return what is wrong with the lines themselves: types that cannot be read, and a status that is old."""
+    texts = [unreadable_lines(name) for name in unreadable]
+    if status_age_s is not None and status_age_s > STATUS_AGE_LIMIT_S:
+        texts.append(f"no status of the master for {status_age_s:.0f} s")
+    return [Finding(Level.CARE, text) for text in texts]
 
 
 def station_findings(

@@ -38,6 +38,11 @@ class History:
         self._items.append(item)
         self._count += 1
 
+    def clear(self) -> None:
+        """Drop all items. A number is left out, so that a reader that has them sees a gap and drops them as well."""
+        self._items.clear()
+        self._count += 1
+
     def since(self, cursor: int) -> dict[str, Any]:
         """Return the items from a cursor on, as far as they are kept, with the number of the first."""
         fresh = min(self._count - cursor, len(self._items))
@@ -69,6 +74,11 @@ class Trail(History):
         if self._last is not None:
             self._last = None
             self.add(None)
+
+    def clear(self) -> None:
+        """Drop all points: the next one is in another frame."""
+        super().clear()
+        self._last = None
 
 
 class Residuals(History):

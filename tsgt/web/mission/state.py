@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tsgt.client.delay import LeastDelay
@@ -35,6 +34,7 @@ from tsgt.web.mission.verdict import (
     PoseFacts,
     StreamFacts,
     judge,
+    repeats,
     stream_findings,
 )
 
@@ -54,6 +54,9 @@ decoded when the state is looked at.
 """
 
 SMOOTHED_AGE_LIMIT_S = 3.0
+
+UNREADABLE_S = 3.0
+"""For this long a line that cannot be read is a finding; lines of a master come each second at least."""
 
 MAX_TEXT = 300
 
@@ -92,6 +95,7 @@ class MissionState:
         self.residuals = Residuals()
         self.events = History(EVENTS)
         self._setup_number = 0
+        self._frames: Any = None
         self._hold = Hold()
         self._forget()
 
@@ -103,15 +107,20 @@ class MissionState:
         self._setup: SetupRecord | None = None
         self._status: StatusRecord | None = None
         self._status_s = 0.0
-        self._live: _Pose | None = None
-        self._live_s = -math.inf
-        self._live_valid: bool | None = None
-        self._not_decoded: bytes | None = None  # the newest live pose
-        self._smoothed: _Pose | None = None
+        self._forget_poses()
         self._share = Share()
-        self._sights: dict[int, stations.Sight] = {}
+        self._unreadable_s: dict[str, float] = {}  # when the last line of a type came that could not be read
+        self._fences = findings.FenceMonitor()
         self._standing = findings.StandingEvents()
         self._stamp_ns = 0
+
+    def _forget_poses(self) -> None:
+        self._live: _Pose | None = None
+        self._live_valid: bool | None = None
+        self._not_decoded: tuple[bytes, float] | None = None  # the newest live pose, and when it arrived
+        self._smoothed: _Pose | None = None
+        self._sights: dict[int, stations.Sight] = {}
+        self.trail.interrupt()
 
     # --- in ---------------------------------------------------------------------------------------------------
 
@@ -125,7 +134,6 @@ class MissionState:
         """Take note that there is no connection; ``problem``: why, in one line."""
         self._connected = False
         self._problem = problem
-        self.trail.interrupt()
 
     def line(self, data: bytes, now_s: float) -> None:
         """Take a line of the stream.
@@ -139,8 +147,13 @@ class MissionState:
         name = found[1].decode() if found else decode(Typed, data).type
         self._line_s = now_s
         take = self._takers().get(name)
-        if take is not None:
+        if take is None:
+            return
+        try:
             take(data, now_s)
+        except ValueError:
+            self._unreadable_s[name] = now_s
+            raise
 
     def _takers(self) -> dict[str, Callable[[bytes, float], None]]:
         return {
@@ -162,24 +175,35 @@ class MissionState:
     def _take_setup(self, data: bytes, _now_s: float) -> None:
         self._setup = decode(SetupRecord, data)
         self._setup_number += 1
+        frames = (
+            self._setup.frame,
+            [(each.id, each.position_m, each.orientation_xyzw) for each in self._setup.stations],
+        )
+        if self._frames is not None and frames != self._frames:
+            self._forget_poses()
+            self.trail.clear()
+        self._frames = frames
 
     def _take_pose(self, data: bytes, now_s: float) -> None:
         if _SMOOTHED in data:
             self._take_smoothed(data, now_s)
             return
         valid = _VALID in data
-        self._share.count(now_s, valid=valid)
-        self._live_s = now_s
-        self._not_decoded = data
-        if valid == self._live_valid and self._live is not None and now_s - self._live.at_s < POSE_INTERVAL_S:
-            return
-        self._live_valid = valid
-        self._decode_newest(now_s)
+        self._not_decoded = data, now_s
+        try:
+            if valid != self._live_valid or self._pose_age_s(now_s) >= POSE_INTERVAL_S:
+                self._live_valid = valid
+                self._decode_newest()
+        except ValueError:
+            valid = False
+            raise
+        finally:
+            self._share.count(now_s, valid=valid)
 
-    def _decode_newest(self, now_s: float) -> None:
-        data, self._not_decoded = self._not_decoded, None
-        if data is None:
+    def _decode_newest(self) -> None:
+        if self._not_decoded is None:
             return
+        (data, now_s), self._not_decoded = self._not_decoded, None
         record = decode(PoseRecord, data)
         self._live = _Pose(record, now_s)
         self._stamp_ns = max(self._stamp_ns, record.stamp_ns)
@@ -210,6 +234,9 @@ class MissionState:
     def _take_status(self, data: bytes, now_s: float) -> None:
         self._status, self._status_s = decode(StatusRecord, data), now_s
         self._stamp_ns = self._status.stamp_ns
+        heard_s = [each.last_heard_s for each in self._status.stations if each.last_heard_s is not None]
+        if heard_s:
+            self._standing.received(self._stamp_ns - round(min(heard_s) * 1e9))
         now_ns = round(now_s * 1e9)
         self._least_delay.sample(self._stamp_ns, now_ns)
         self._delay_s = (now_ns - self._least_delay.here_ns(self._stamp_ns)) / 1e9
@@ -234,6 +261,11 @@ class MissionState:
         """The set-up in force; None while it is unknown."""
         return self._setup
 
+    @property
+    def frames(self) -> Any:
+        """What the frame of trail and poses is compared by: the frames of the stations in it."""
+        return self._frames
+
     def live(self, now_s: float) -> bool:
         """Return whether the stream tells of the present: it is neither lost nor silent nor late."""
         return not stream_findings(self._stream(now_s))
@@ -252,11 +284,17 @@ class MissionState:
 
     def view(self, now_s: float) -> dict[str, Any]:
         """Return everything that the page shows except the histories."""
-        with suppress(ValueError):  # It is no pose: the one before stays
-            self._decode_newest(self._live_s)
+        if self._not_decoded is not None:
+            arrived_s = self._not_decoded[1]
+            try:
+                self._decode_newest()
+            except ValueError:  # It is no pose: the one before stays, and ages
+                self._unreadable_s["pose"] = arrived_s
         found = self._findings(now_s)
         shown = self._hold.update(found[0], now_s)
-        others = [each for each in found if each.level is not Level.GOOD and each.cause not in shown.cause]
+        others = [
+            each for each in found if each.level is not Level.GOOD and not repeats(shown.cause, each.cause)
+        ]
         live = found[0].level is not Level.STREAM_STOPPED
         return {
             "now_s": round(now_s, 2),
@@ -277,7 +315,7 @@ class MissionState:
                 self._setup.limits if self._setup is not None else None,
                 self._status,
                 share=self._share.value(now_s),
-                elapsed_s=now_s - self._live_s,
+                elapsed_s=self._pose_age_s(now_s),
             )
             if live
             else {},
@@ -328,14 +366,16 @@ class MissionState:
         if pose is not None:
             record = pose.record
             facts = PoseFacts(
-                age_s=now_s - self._live_s,
+                age_s=self._pose_age_s(now_s),
                 valid=record.valid and bool(self._live_valid),
                 explanation=findings.explanation(record, limits, conditions, radio_failure),
                 degradations=findings.degradations(record, self._recent_smoothed(now_s), limits, conditions),
             )
+        unreadable = [name for name, at_s in self._unreadable_s.items() if now_s - at_s < UNREADABLE_S]
         others = [
+            *self._fences.findings(self._setup, self._position()),
             *self._standing.fences(),
-            *findings.fence_findings(self._setup, self._position()),
+            *findings.line_findings(unreadable, None if self._status is None else now_s - self._status_s),
             *findings.storage_findings(self._status),
             *self._standing.findings(),
             *findings.station_findings(self._status, conditions, radio_failure),
@@ -343,7 +383,12 @@ class MissionState:
             *findings.odometry_findings(self._status),
         ]
         uncalibrated = None if self._status is None else self._status.no_poses
-        waiting_for = uncalibrated or radio_failure or findings.waiting_for(conditions)
+        waiting_for = (
+            uncalibrated
+            or (findings.unreadable_lines("pose") if "pose" in unreadable else "")
+            or radio_failure
+            or findings.waiting_for(conditions)
+        )
         return judge(self._stream(now_s), facts, waiting_for, others)
 
     def _conditions(self, now_s: float) -> dict[int, stations.Condition]:
@@ -363,10 +408,14 @@ class MissionState:
         pose = self._smoothed
         return pose.record if pose is not None and now_s - pose.at_s < SMOOTHED_AGE_LIMIT_S else None
 
+    def _pose_age_s(self, now_s: float) -> float:
+        """Return the time since the newest readable live pose arrived."""
+        return math.inf if self._live is None else now_s - self._live.at_s
+
     def _valid_now(self, now_s: float) -> bool:
         """Return whether there is a valid pose of now."""
         pose = self._live
-        fresh = now_s - self._live_s <= POSE_AGE_LIMIT_S
+        fresh = self._pose_age_s(now_s) <= POSE_AGE_LIMIT_S
         return pose is not None and pose.record.valid and bool(self._live_valid) and fresh
 
     def _position(self) -> tuple[float, float] | None:
@@ -394,7 +443,7 @@ class MissionState:
             },
             "speed_mps": None if velocity is None else rounded(math.hypot(*velocity), 2),
             "valid": self._valid_now(now_s),
-            "age_s": rounded(now_s - self._live_s, 2),
+            "age_s": rounded(self._pose_age_s(now_s), 2),
             "kind": record.kind,
         }
 

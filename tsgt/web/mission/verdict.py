@@ -5,6 +5,7 @@ A fourth word, NO CONNECTION, is the browser's own: it comes when this program f
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -120,9 +121,17 @@ def judge(
 
 
 def _without_repetition(items: Sequence[Finding]) -> list[Finding]:
-    """Return the findings without those whose text another one has, or begins with."""
+    """Return the findings without those whose text another one has as well."""
     once = list({each.cause: each for each in reversed(items)}.values())[::-1]
-    return [each for each in once if not any(o.cause.startswith(each.cause) for o in once if o is not each)]
+    return [each for each in once if not any(repeats(o.cause, each.cause) for o in once if o is not each)]
+
+
+def repeats(text: str, cause: str) -> bool:
+    """Return whether a text has a cause as a whole part of it, as in ``no pose for 2 s: CAUSE`` or ``CAUSE: 3 MB left``.
+
+    A cause that another one only begins with is another cause: geofences may have names that begin alike.
+    """
+    return re.search(rf"(?:^|[:;] ){re.escape(cause)}(?:$|[:;])", text) is not None
 
 
 class Hold:

@@ -30,6 +30,7 @@ let received_ms = -Infinity, timely_ms = -Infinity; // the last message, and the
 let clocks_ms = 0, received_clocks_ms = 0; // what clocks() was at the last message or connection, and at the last message
 let least_offset_ms = Infinity, late_ms = 0;
 let view = null, residuals = [], events = [];
+const ends = {}; // of each series: the number that its next item has
 let shown = "", sounded = 0, audio = null;
 let playing = { at_s: 0, speed: 1, length_s: 0, start_ms: 0 }, seeking = false;
 
@@ -82,19 +83,29 @@ function take(message) {
   if (late_ms <= LATE_LIMIT_MS) timely_ms = now_ms;
   clocks_ms = received_clocks_ms = clocks();
   view = message.view;
-  if (message.setup !== undefined) { map.setup = message.setup; map.fitted = map.fitted && !message.first; }
-  map.trail = appended(message.first ? [] : map.trail, message.trail, MAX_TRAIL);
-  residuals = appended(message.first ? [] : residuals, message.residuals, MAX_RESIDUALS);
+  if (message.setup !== undefined) {
+    // In another frame the last valid pose was elsewhere.
+    if (map.setup && message.setup && JSON.stringify(map.setup.stations) !== JSON.stringify(message.setup.stations)) map.last = null;
+    map.setup = message.setup;
+    map.fitted = map.fitted && !message.first;
+  }
+  map.trail = appended(map.trail, message, "trail", MAX_TRAIL);
+  residuals = appended(residuals, message, "residuals", MAX_RESIDUALS);
   if (message.first || message.events.items.length) {
-    events = appended(message.first ? [] : events, message.events, MAX_EVENTS);
+    events = appended(events, message, "events", MAX_EVENTS);
     showEvents();
   }
   if (message.replay) showReplay(message.replay);
   show();
 }
 
-function appended(list, series, limit) {
-  return [...list, ...series.items].slice(-limit);
+// What is here already may come again, just after connecting; after a gap the server has dropped everything before it.
+function appended(list, message, name, limit) {
+  const { first, items } = message[name];
+  const kept = message.first || first > ends[name] ? [] : list;
+  const fresh = message.first ? items : items.slice(Math.max(ends[name] - first, 0));
+  ends[name] = first + items.length;
+  return [...kept, ...fresh].slice(-limit);
 }
 
 // What the page may claim now: the server's verdict only while its messages come, and come in time.
@@ -203,8 +214,8 @@ function showFigures(f) {
   figure("f-later", length(later.position_mm), f.smoothed ? rotation(f.smoothed) + (f.delay_s ? `, ${f.delay_s} s later` : ", final") : "", gradedSigmas(later, f.smoothed_limit_mm, f.smoothed_rotation_limit_deg));
   figure("f-fit", length(f.residual_mm), f.residual_limit_mm ? `limit ${f.residual_limit_mm.toFixed(0)} mm` : "", graded(f.residual_mm, f.residual_limit_mm));
   const share = f.valid_share;
-  figure("f-valid", share === null || share === undefined ? "–" : `${(Math.floor(1000 * share) / 10).toFixed(share === 1 ? 0 : 1)} %`,
-    f.poses ? `last minute; ${f.valid_poses} of ${f.poses}` : "", share === null || share === undefined ? "" : share < 0.9 ? "bad" : share < 0.99 ? "warn" : "ok");
+  figure("f-valid", share === null || share === undefined ? "–" : `${(100 * share).toFixed(share === 1 ? 0 : 1)} %`,
+    f.poses ? `last minute; ${f.valid_poses} of ${f.poses} since the start` : "", share === null || share === undefined ? "" : share < 0.9 ? "bad" : share < 0.99 ? "warn" : "ok");
   const age = f.data_age_s;
   figure("f-age", age === null || age === undefined ? "–" : `${age.toFixed(1)} s`,
     f.oldest_age_s !== null && f.oldest_age_s !== undefined ? `oldest prism ${f.oldest_age_s.toFixed(1)} s` : "",

@@ -69,6 +69,17 @@ inline std::int64_t monotonic_ns() {
   return std::int64_t{now.tv_sec} * 1000000000 + now.tv_nsec;
 }
 
+namespace detail {
+
+// The sum, or the largest number of its sign: times from outside may be absurd. Its negative always fits, too.
+inline std::int64_t sum(std::int64_t a, std::int64_t b) {
+  if (b > 0 && a > INT64_MAX - b) return INT64_MAX;
+  if (b < 0 && a < -INT64_MAX - b) return -INT64_MAX;
+  return a + b;
+}
+
+}  // namespace detail
+
 // ---------------------------------------------------------------------------------------------------------------------
 // JSON, as far as lines of the stream need it. Integers keep all 64 bits, numbers with a fraction become the nearest double.
 
@@ -183,16 +194,28 @@ class Parser {
     return value;
   }
 
+  void take_digits() {
+    const std::size_t start = at_;
+    while (peek() >= '0' && peek() <= '9') ++at_;
+    if (at_ == start) fail();
+  }
+
   void parse_number(Value& value) {
     const std::size_t start = at_;
     bool whole = true;
-    while (at_ < text_.size() && std::strchr("+-.0123456789eE", text_[at_]) != nullptr && text_[at_] != '\0') {
-      whole = whole && (text_[at_] == '-' || (text_[at_] >= '0' && text_[at_] <= '9'));
-      ++at_;
+    take("-");
+    if (!take("0")) take_digits();
+    if (take(".")) {
+      whole = false;
+      take_digits();
+    }
+    if (take("e") || take("E")) {
+      whole = false;
+      if (!take("+")) take("-");
+      take_digits();
     }
     const char* begin = text_.data() + start;
     const char* end = text_.data() + at_;
-    if (begin == end || *begin == '+') fail();
     if (whole) {
       std::int64_t integer = 0;
       const auto [rest, error] = std::from_chars(begin, end, integer);
@@ -294,7 +317,7 @@ struct Pose {
   std::int64_t epoch_ns = 0;  // time of the pose on monotonic_ns() of this computer
 
   // Time since the pose's epoch in s, by this computer's clock alone; too small by the least delay of any line.
-  double age_s() const { return static_cast<double>(monotonic_ns() - epoch_ns) / 1e9; }
+  double age_s() const { return static_cast<double>(detail::sum(monotonic_ns(), -epoch_ns)) / 1e9; }
 };
 
 struct Event {
@@ -451,11 +474,11 @@ class LeastDelay {
  public:
   bool known() const { return known_; }
   void sample(std::int64_t origin, std::int64_t arrived) {
-    std::int64_t offset = arrived - origin;
-    if (known_) offset = std::min(offset, offset_ + std::max<std::int64_t>(0, arrived - at_) / 5000);
+    std::int64_t offset = sum(arrived, -origin);
+    if (known_) offset = std::min(offset, sum(offset_, std::max<std::int64_t>(0, sum(arrived, -at_)) / 5000));
     offset_ = offset, at_ = arrived, known_ = true;
   }
-  std::int64_t here(std::int64_t origin) const { return origin + offset_; }
+  std::int64_t here(std::int64_t origin) const { return sum(origin, offset_); }
 
  private:
   bool known_ = false;
@@ -470,6 +493,13 @@ std::optional<std::array<double, N>> numbers(const json::Value& value) {
   std::array<double, N> result{};
   std::transform(items.begin(), items.end(), result.begin(), [](const json::Value& item) { return item.number(); });
   return result;
+}
+
+// A time in ns, whose negative fits as well.
+inline std::int64_t time(const json::Value& value) {
+  const std::int64_t nanoseconds = value.integer();
+  if (nanoseconds < -INT64_MAX) throw std::invalid_argument("a time beyond 64 bits");
+  return nanoseconds;
 }
 
 inline std::optional<double> optional_number(const json::Value& value) {
@@ -552,9 +582,10 @@ class Stream {
       caught_up_ = true;  // nothing more will tell the age of what is held
       release();
       failures_at_key_ = at_key_ ? failures_at_key_ + 1 : 0;  // the first time, the relay may have been busy
-      at_key_ = false;
+      const std::string reason = full_ ? "the relay has too many readers" : lost.what();
+      at_key_ = full_ = false;
       if (failures_at_key_ >= 2 && !was_ready_) throw Error(source_ + ": the relay has another key, or has seen too many wrong ones");
-      problem_ = source_ + ": " + lost.what();
+      problem_ = source_ + ": " + reason;
       retry_ = monotonic_ns() + back_off_;
       back_off_ = std::min(2 * back_off_, detail::kMaxBackOff);
     }
@@ -647,6 +678,11 @@ class Stream {
     for (std::size_t end; (end = received_.find('\n', start)) != std::string::npos; start = end + 1)
       take(std::string_view(received_).substr(start, end - start));
     received_.erase(0, start);
+    if (ready_ && !full_) {
+      was_ready_ = true;
+      problem_.clear();
+      back_off_ = detail::kFirstBackOff;
+    }
     if (received_.size() > (over_relay() && !ready_ ? detail::kMaxHandshake : detail::kMaxLine))
       throw detail::Lost("a line is too long: not a stream of tsgt");
     release();
@@ -678,7 +714,7 @@ class Stream {
     empty_ = now;
     const std::int64_t offset_now = offset();
     if (caught_up_ || (offset_now == detail::kNoOffset && held_.empty())) return;
-    if (!steady_ || offset_now < steady_->second - detail::kSteady) {
+    if (!steady_ || offset_now < detail::sum(steady_->second, -detail::kSteady)) {
       caught_up_ = prompt && !steady_ && offset_now != detail::kNoOffset;
       steady_ = {now, offset_now};
     } else if (now >= steady_until()) {
@@ -693,7 +729,7 @@ class Stream {
       if (auto* pose = std::get_if<Pose>(&held_.front())) {
         if (session_.known()) pose->epoch_ns = session_.here(pose->stamp_ns);
         if (over_relay()) pose->epoch_ns = network_.here(pose->epoch_ns);
-        if (pose->kind != "smoothed") latest_ = *pose;
+        if (pose->kind == "predicted" || pose->kind == "interpolated") latest_ = *pose;
       }
       records_.push_back(std::move(held_.front()));
       held_.pop_front();
@@ -703,7 +739,7 @@ class Stream {
   void take(std::string_view line) {
     if (!over_relay()) {
       if (!ready_ && connections_ > 1) gap(std::nullopt, "the connection to the master was lost");
-      become_ready();
+      ready_ = true;
       decode(line, heard_);
     } else if (ready_) {
       frame(line);
@@ -712,12 +748,6 @@ class Stream {
     } else {
       welcome(line);
     }
-  }
-
-  void become_ready() {
-    ready_ = was_ready_ = true;
-    problem_.clear();
-    back_off_ = detail::kFirstBackOff;
   }
 
   void answer(std::string_view line) {
@@ -754,7 +784,7 @@ class Stream {
     network_.sample(relay_ns, heard_);
     stream_ = stream, next_ = first;
     line_key_ = detail::hmac(key_, std::string(detail::kRelay) + " lines\n" + stream_);
-    become_ready();
+    ready_ = true;
   }
 
   void frame(std::string_view line) {
@@ -766,7 +796,7 @@ class Stream {
     const std::int64_t at = detail::number(detail::word(rest)), time = detail::number(detail::word(rest));
     if (at < next_) throw detail::Lost("the relay repeats a line");
     if (kind == "beat" && time <= last_beat_) throw detail::Lost("the relay repeats a sign of life");
-    if (kind == "beat") last_beat_ = time;
+    if (kind == "beat") last_beat_ = time, full_ = full_ || rest == "full";
     if (kind != "head") network_.sample(time, heard_);
     if (at > next_) gap(at - next_, "this reader was too slow for the relay");
     next_ = at + (kind == "line" ? 1 : 0);
@@ -797,12 +827,12 @@ class Stream {
       }
       if (!greeted_) throw std::invalid_argument("no greeting");
       const bool predicted = type == "pose" && line["kind"].text() == "predicted";
-      if (predicted || type == "status" || type == "event") session_.sample(line["stamp_ns"].integer(), arrived);
-      if (type == "measurement" || type == "point") session_.sample(line["received_ns"].integer(), arrived);
+      if (predicted || type == "status" || type == "event") session_.sample(detail::time(line["stamp_ns"]), arrived);
+      if (type == "measurement" || type == "point") session_.sample(detail::time(line["received_ns"]), arrived);
       if (type == "pose") {
         pose(line, arrived);
       } else if (type == "event") {
-        Event event{line["stamp_ns"].integer(), line["event"].text(), line["message"].text(),
+        Event event{detail::time(line["stamp_ns"]), line["event"].text(), line["message"].text(),
                     detail::optional_integer(line["station"]), detail::optional_integer(line["count"])};
         const bool lost = event.event == "lines_lost";
         const auto count = event.count;
@@ -819,7 +849,7 @@ class Stream {
 
   void pose(const json::Value& line, std::int64_t arrived) {
     Pose pose;
-    pose.stamp_ns = line["stamp_ns"].integer();
+    pose.stamp_ns = detail::time(line["stamp_ns"]);
     pose.frame = line["frame"].text();
     pose.child_frame = line["child_frame"].text();
     pose.estimator = line["estimator"].text();
@@ -841,6 +871,7 @@ class Stream {
 
   std::string source_, host_, port_, key_, line_key_, stream_, challenge_, request_, received_, problem_;
   bool resume_, connecting_ = false, more_ = false, ready_ = false, was_ready_ = false, at_key_ = false, greeted_ = false;
+  bool full_ = false;  // the relay has said that it has too many readers, and ends the connection
   bool caught_up_ = false;
   int socket_ = -1, connections_ = 0, failures_at_key_ = 0, attempts_ = 0;
   std::int64_t next_ = 0, last_beat_ = 0, heard_ = 0, empty_ = 0, retry_ = 0, back_off_ = detail::kFirstBackOff;

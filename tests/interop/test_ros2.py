@@ -122,20 +122,22 @@ def test_lost_stream_is_stale_and_repeats_no_pose(distribution: str, tmp_path: P
 
 
 def test_diagnostics_say_what_is_wrong(distribution: str, tmp_path: Path) -> None:
-    """An invalid pose is not published, and an error there; so is a station without an answer."""
+    """An invalid pose is not published, and an error there; so is a silent station."""
     with running(distribution, tmp_path) as system:
         poses, _ = drive(system, seconds=0.2)
-        stations = (StationStatus(id=1, measurements=5, usable=4, age_s=0.2, status=None, answering=False),)
+        silent = StationStatus(
+            id=1, measurements=5, usable=4, age_s=10.2, status=None, answering=False, last_heard_s=10.0
+        )
         invalid = replace(poses[-1], valid=False, reason="outage", quality="invalid", degraded_by=())
         before = len(system.messages("/diagnostics"))
         while len(found := system.messages("/diagnostics")) < before + 2:  # an old one would be stale instead
             now = time.time_ns()
-            system.send(replace(invalid, stamp_ns=now), replace(STATUS, stamp_ns=now, stations=stations))
+            system.send(replace(invalid, stamp_ns=now), replace(STATUS, stamp_ns=now, stations=(silent,)))
             time.sleep(0.05)
         last = found[-1]
         published = len(system.messages("/tsgt/pose"))
     levels = {status["name"]: (status["level"][0], status["message"]) for status in last.message["status"]}
     assert published == len(poses)
     assert levels["tsgt: pose"] == (ERROR, "invalid: outage")
-    assert levels["tsgt: station 1"] == (ERROR, "no answer over the radio")
+    assert levels["tsgt: station 1"] == (ERROR, "silent for 10 s")
     assert levels["tsgt: stream"] == (OK, "connected")

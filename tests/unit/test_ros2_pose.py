@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
+from harness.files.records import HELLO, SETUP, STATUS
+from harness.readers.web import station
 
-from tsgt.client import Pose, records
+from tsgt.client import Hello, Pose, Setup, StationStatus, Status, records
+from tsgt.client.build import build, load
+from tsgt.model import Status as MeasurementStatus
+from tsgt.recording import LOW_BATTERY_PERCENT, encode_line
+from tsgt.recording.conditions import MAX_AGE_S, MAX_UNASKED_S, StationCondition, station_condition
 
 NODE = Path(__file__).parents[2] / "integrations" / "ros2" / "tsgt_ros2" / "pose_publisher.py"
 
@@ -21,7 +29,7 @@ MODULES = (
 )  # fmt: skip
 
 NOW_NS = 10**15
-OK, ERROR, STALE = b"\x00", b"\x02", b"\x03"
+OK, WARN, ERROR, STALE = b"\x00", b"\x01", b"\x02", b"\x03"
 
 
 class RosNode:
@@ -55,7 +63,9 @@ def publisher(monkeypatch: pytest.MonkeyPatch) -> Any:
         monkeypatch.setitem(sys.modules, name, MagicMock())
     monkeypatch.setattr(sys.modules["rclpy.node"], "Node", RosNode)
     diagnostics = sys.modules["diagnostic_msgs.msg"]
-    levels = type("DiagnosticStatus", (SimpleNamespace,), {"OK": OK, "ERROR": ERROR, "STALE": STALE})
+    levels = type(
+        "DiagnosticStatus", (SimpleNamespace,), {"OK": OK, "WARN": WARN, "ERROR": ERROR, "STALE": STALE}
+    )
     monkeypatch.setattr(diagnostics, "DiagnosticStatus", levels)
     monkeypatch.setattr(diagnostics, "DiagnosticArray", SimpleNamespace)
     spec = importlib.util.spec_from_file_location("pose_publisher", NODE)
@@ -86,10 +96,21 @@ def pose(age_s: float, **changes: Any) -> Pose:
     return Pose(**fields | changes)
 
 
-def diagnosis(node: Any) -> tuple[bytes, str]:
-    """Return level and message of the pose in the diagnostics of now."""
+def status(*stations: Any, **changes: Any) -> Status:
+    """Return the client's record of a status with these stations."""
+    built = (build(StationStatus, asdict(each)) for each in stations)
+    return Status(stamp_ns=10**18, poses=5, valid_poses=4, stations=tuple(built), **changes)
+
+
+def setup(**changes: Any) -> Setup:
+    """Return the client's record of a set-up."""
+    return build(Setup, load(encode_line(SETUP)) | changes)
+
+
+def diagnosis(node: Any, name: str = "pose") -> tuple[bytes, str]:
+    """Return level and message of the pose, or of another entry, in the diagnostics of now."""
     node._publish_diagnostics()
-    (found,) = (each for each in node.published["/diagnostics"][-1].status if each.name == "tsgt: pose")
+    (found,) = (each for each in node.published["/diagnostics"][-1].status if each.name == f"tsgt: {name}")
     return found.level, found.message
 
 
@@ -122,10 +143,133 @@ def test_last_pose_is_not_good_for_ever(publisher: Any) -> None:
 def test_final_pose_may_be_as_old_as_the_lag_of_the_set_up(publisher: Any) -> None:
     """A master with a longer lag sends them later."""
     node = publisher(series="smoothed")
-    node._setup = SimpleNamespace(lag_s=10.0)
+    node.take(setup(lag_s=10.0))
     node.take(pose(10.3, kind="smoothed"))
     assert len(node.published["/tsgt/pose"]) == 1
     assert diagnosis(node) == (OK, "good")
     node.take(pose(13.0, kind="smoothed"))
     assert len(node.published["/tsgt/pose"]) == 1
     assert diagnosis(node)[0] == STALE
+
+
+def test_pose_that_never_came_is_an_error(publisher: Any) -> None:
+    """With the reason where the master gives one; without a stream nothing is known."""
+    node = publisher()
+    node.stream.problem = "no connection yet"
+    assert diagnosis(node) == (STALE, "no pose yet")
+    node.stream.problem = ""
+    node.take(build(Hello, load(encode_line(HELLO))))
+    assert diagnosis(node) == (ERROR, "no pose yet")
+    node.take(status(no_poses="there is no frames.toml"))
+    assert diagnosis(node) == (ERROR, "no poses: there is no frames.toml")
+    node.take(setup())
+    assert diagnosis(node) == (ERROR, "no pose yet")
+    node.take(pose(0.0))
+    assert diagnosis(node) == (OK, "good")
+
+
+def test_pose_of_the_last_session_is_none_of_the_next(publisher: Any) -> None:
+    """A master that was restarted has sent no pose yet."""
+    node = publisher()
+    node.take(pose(0.0))
+    node.take(status(station(1)))
+    node.take(build(Hello, load(encode_line(HELLO))))
+    assert diagnosis(node) == (ERROR, "no pose yet")
+    assert [each.name for each in node.published["/diagnostics"][-1].status] == ["tsgt: stream", "tsgt: pose"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "rate_hz", "outage_s", "good_s", "stale_s"),
+    [
+        ("predicted", 20.0, 1.0, 0.55, 0.65),
+        ("predicted", 1.0, 1.0, 2.4, 2.6),
+        ("interpolated", 20.0, 5.0, 8.0, 8.2),
+        ("smoothed", 0.5, 1.0, 8.9, 9.1),
+    ],
+)
+def test_slow_poses_are_good_until_the_next_is_late(
+    publisher: Any, kind: str, rate_hz: float, outage_s: float, good_s: float, stale_s: float
+) -> None:
+    """Two periods beyond the age of their kind; an interpolated one waits for a measurement, up to the outage limit."""
+    node = publisher(series="smoothed" if kind == "smoothed" else "live")
+    limits = load(encode_line(SETUP))["limits"] | {"outage_s": outage_s}
+    node.take(setup(rate_hz=rate_hz, lag_s=3.0, limits=limits))
+    node.take(pose(0.0, kind=kind))
+    for age_s, level in ((good_s, OK), (stale_s, STALE)):
+        node._pose = pose(age_s, kind=kind)
+        assert diagnosis(node)[0] == level
+
+
+def test_pose_that_came_too_late_is_stale_also_where_poses_are_slow(publisher: Any) -> None:
+    """It was not published."""
+    node = publisher()
+    node.take(setup(rate_hz=0.5))
+    node.take(pose(0.6))
+    assert node.published["/tsgt/pose"] == []
+    assert diagnosis(node) == (STALE, "0.6 s old")
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, (OK, "measures")),
+        ({"last_heard_s": 60.3, "age_s": 60.8}, (ERROR, "silent for 60 s")),
+        ({"last_heard_s": 4.0, "answering": False}, (ERROR, "silent for 4 s")),
+        ({"last_heard_s": 4.0, "age_s": 4.2}, (OK, "measures")),
+        ({"answering": False}, (OK, "measures")),
+        (
+            {"last_heard_s": None, "age_s": None, "status": None, "answering": None},
+            (ERROR, "not received yet"),
+        ),
+        ({"age_s": 100.0}, (WARN, "no measurement for 100 s")),
+        ({"age_s": None, "status": None}, (WARN, "no measurement yet")),
+        ({"status": MeasurementStatus.NO_TARGET}, (WARN, "no prism")),
+        ({"battery_percent": 3, "problem": "change its battery"}, (WARN, "change its battery")),
+        ({"battery_percent": 3}, (WARN, "battery 3 %")),
+        ({"age_s": 100.0, "battery_percent": 3}, (WARN, "no measurement for 100 s; battery 3 %")),
+    ],
+)
+def test_station_is_diagnosed(publisher: Any, changes: dict[str, Any], expected: tuple[bytes, str]) -> None:
+    """In the words of ``tsgt status``."""
+    node = publisher()
+    node.take(status(station(1, **changes)))
+    assert diagnosis(node, "station 1") == expected
+
+
+def test_station_levels_follow_the_conditions_of_all(publisher: Any) -> None:
+    """The node is without the package's numpy, so it repeats their rules."""
+    node = publisher()
+    levels = dict.fromkeys(StationCondition, WARN)
+    levels |= {
+        StationCondition.NOT_RECEIVED: ERROR,
+        StationCondition.SILENT: ERROR,
+        StationCondition.TRACKING: OK,
+    }
+    for heard_s, after_s, answering, last, battery_percent in itertools.product(
+        (None, 0.1, MAX_AGE_S - 0.1, MAX_AGE_S + 0.1, MAX_UNASKED_S - 1, MAX_UNASKED_S + 1),
+        (None, 0.1, MAX_AGE_S - 0.1, MAX_AGE_S + 0.1),
+        (None, True, False),
+        (None, *MeasurementStatus),
+        (None, LOW_BATTERY_PERCENT - 1, LOW_BATTERY_PERCENT),
+    ):
+        one = station(
+            1, last_heard_s=heard_s, age_s=None if after_s is None else (heard_s or 0.0) + after_s,
+            answering=answering, status=last, battery_percent=battery_percent,
+        )  # fmt: skip
+        node.take(status(one))
+        expected = levels[station_condition(one)]
+        if expected == OK and one.action_required:
+            expected = WARN
+        assert diagnosis(node, "station 1")[0] == expected, one
+
+
+def test_stations_are_stale_when_no_status_comes(publisher: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although poses do, as when lines of a later version cannot be read."""
+    node = publisher()
+    node.take(status(*STATUS.stations))
+    later_ns = NOW_NS + 5 * 10**9
+    monkeypatch.setitem(type(node).take.__globals__, "monotonic_ns", lambda: later_ns)
+    monkeypatch.setattr(records, "monotonic_ns", lambda: later_ns)
+    node.take(pose(-5.0))
+    assert diagnosis(node) == (OK, "good")
+    assert diagnosis(node, "station 1") == (STALE, "no status for 5 s")

@@ -39,6 +39,8 @@ class Link(Protocol):
     """Whether the present connection has come as far as to give lines."""
     failed_at_key: bool
     """Whether the present connection ended, or would end now, at a peer that was shown the proof of a key."""
+    full: bool
+    """Whether the peer of the present connection has said that it has too many readers, and ends it."""
 
     def connected(self, channel: str) -> bytes:
         """Begin a new connection, and return what to send. ``channel``: what TLS binds proofs to."""
@@ -79,6 +81,7 @@ class SocketLink:
 
     silence_timeout_ns: int | None = None
     failed_at_key = False
+    full = False
 
     def __init__(self) -> None:
         self._connections = 0
@@ -130,6 +133,7 @@ class RelayLink:
         self._has_hello = False
         self.ready = False
         self.failed_at_key = False
+        self.full = False
 
     @property
     def position(self) -> wire.Position | None:
@@ -141,7 +145,7 @@ class RelayLink:
         self._channel = channel
         self._splitter = LineSplitter(wire.MAX_HANDSHAKE_BYTES)
         self._challenge = self._request = ""
-        self.ready = self.failed_at_key = False
+        self.ready = self.failed_at_key = self.full = False
         return b""
 
     def receive(self, data: bytes, now_ns: int) -> Iterator[Arrival | Gap | bytes]:
@@ -196,6 +200,7 @@ class RelayLink:
                 if frame.time_ns <= self._last_beat_ns:
                     raise StreamError("the relay repeats a sign of life")
                 self._last_beat_ns = frame.time_ns
+                self.full = self.full or frame.text == wire.FULL
             self._delay.sample(frame.time_ns, now_ns)
         if frame.number > expected:
             yield Gap(lines=frame.number - expected, reason="this reader was too slow for the relay")

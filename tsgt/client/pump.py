@@ -238,7 +238,7 @@ class Pump:
                 self._backlog.put(item)
             else:
                 self._decode(item)
-        if self._link.ready:
+        if self._link.ready and not self._link.full:
             self._was_ready = True
             self._back_off_s = BACK_OFF_S[0]
             self._logged.clear()
@@ -281,6 +281,8 @@ class Pump:
 
     def _lost(self, error: OSError) -> None:
         self._failures_at_key = self._failures_at_key + 1 if self._link.failed_at_key else 0
+        if self._link.full:
+            error = StreamError("the relay has too many readers")
         self._disconnect()
         self._backlog.ended()
         reason = str(error) if isinstance(error, StreamError) else error.strerror or str(error)
@@ -309,7 +311,7 @@ class Pump:
             self._resolver.close()
         self._socket = self._resolver = self._tls = None
         self._connecting = False
-        self._link.ready = False
+        self._link.ready = self._link.failed_at_key = self._link.full = False
         self._outgoing.clear()
 
 

@@ -34,6 +34,12 @@ MAX_HANDSHAKE_BYTES = 512  # longest line of a handshake, with reserve
 MAX_FRAME_BYTES = (1 << 20) + 256
 """Longest line with its header; lines of the stream have at most 1 MiB."""
 
+FULL = b"full"
+"""Text of the sign of life to a reader for which the relay has no place; the connection ends after the heads.
+
+It comes after the relay's proof, so the reader knows that its key is right.
+"""
+
 NO_CHANNEL = "-"
 """Stands for the certificate's hash in the proofs where there is no TLS."""
 

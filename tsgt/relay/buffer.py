@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from tsgt.client.relay_wire import Frame, Position, encode_frame, line_key
+from tsgt.client.relay_wire import FULL, Frame, Position, encode_frame, line_key
 
 _HEADS = (b'{"type":"hello",', b'{"type":"setup",')
 """Starts of the lines without which a reader cannot understand the following ones, in the order of the stream."""
@@ -79,6 +79,12 @@ class LineBuffer:
             return self.skip()
         return wanted, []
 
+    def waiting_start(self, wanted: Position | None) -> tuple[Position, list[bytes]]:
+        """Return the same for a reader without a place: once it has one, it goes on there, and is told what is lost."""
+        if wanted is not None and wanted.stream == self.stream and wanted.number < self.oldest:
+            return wanted, []
+        return self.start(wanted)
+
     def skip(self) -> tuple[Position, list[bytes]]:
         """Return the oldest place, and the frames that a reader needs before."""
         return Position(self.stream, self.oldest), self._heads(self._oldest_heads, self.oldest)
@@ -91,6 +97,10 @@ class LineBuffer:
         """Return a sign of life for readers that have everything."""
         state = b"connected" if connected else b"waiting"
         return encode_frame(self._key, Frame("beat", self.next, self._at(now_ns), state))
+
+    def full(self, number: int, now_ns: int) -> bytes:
+        """Return the sign of life for a reader that expects this line, and for which there is no place."""
+        return encode_frame(self._key, Frame("beat", number, self._at(now_ns), FULL))
 
     def _heads(self, heads: dict[bytes, tuple[int, bytes]], number: int) -> list[bytes]:
         return [

@@ -190,17 +190,21 @@ class _Connection(asyncio.Protocol):
             server.admission.wrong_key(self.address, server.now_ns())
             self._fail("wrong key")
             return
+        full = len(server.readers) >= MAX_READERS
+        start, heads = server.buffer.waiting_start(wanted) if full else server.buffer.start(wanted)
+        welcome = wire.welcome(server.key, self._channel, self._challenge, requested, start, server.now_ns())
+        greeting = welcome.encode() + b"\n"
+        if full:
+            server.reject(self.address, "too many readers")
+            self._write(greeting + server.buffer.full(start.number, server.now_ns()) + b"".join(heads))
+            self._transport.close()
+            return  # without forgetting its attempts
         server.admission.right_key(self.address)
-        if len(server.readers) >= MAX_READERS:
-            self._fail("too many readers")
-            return
         self._stop_timer()
         server.pending.pop(self, None)
         server.readers.add(self)
-        start, heads = server.buffer.start(wanted)
         self._number = start.number
-        welcome = wire.welcome(server.key, self._channel, self._challenge, requested, start, server.now_ns())
-        self._write(welcome.encode() + b"\n" + b"".join(heads))
+        self._write(greeting + b"".join(heads))
         log.info(
             "relay_reader_connected",
             address=self.address,
@@ -234,7 +238,8 @@ class _Connection(asyncio.Protocol):
 
     def resume_writing(self) -> None:
         self._paused = False
-        self.send_lines()
+        if self in self._server.readers:
+            self.send_lines()
 
     def abort(self) -> None:
         """Close at once."""

@@ -28,9 +28,11 @@ from tf2_msgs.msg import TFMessage
 
 from tsgt.client import (
     LIVE,
+    Hello,
     Measurement,
     Pose,
     Setup,
+    StationStatus,
     Status,
     Stream,
     default_max_age_s,
@@ -43,7 +45,21 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 STREAM_SILENT_S = 2.0  # status lines come every second
+STATUS_SILENT_S = 3.0
+LATE_PERIODS = 2  # one pose may be missing
 LAST_SECOND = 2**31 - 1  # builtin_interfaces/Time has 32 bits
+
+# Of a station, as in tsgt.recording.conditions, which needs more than the client.
+MAX_AGE_S = 3.0
+MAX_UNASKED_S = 60.0
+LOW_BATTERY_PERCENT = 20
+UNUSABLE = {
+    "angle_only": "no distance",
+    "no_target": "no prism",
+    "tilt": "not level",
+    "wrong_distance": "wrong target",
+    "error": "instrument error",
+}
 
 
 class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
@@ -77,9 +93,12 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
         self._lock = threading.Lock()
         self._setup: Setup | None = None
         self._status: Status | None = None
+        self._no_poses: str | None = None
         self._pose: Pose | None = None
+        self._came_stale = False
         self._stale_poses = 0
         self._arrived_ns = 0
+        self._status_ns = 0
         self.stream: Stream | None = None
         self.create_timer(1.0, self._publish_diagnostics)
 
@@ -91,11 +110,16 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
                 self._take_pose(record)
             elif isinstance(record, Measurement):
                 self._take_measurement(record)
+            elif isinstance(record, Hello):  # another session, with other poses and stations
+                self._pose = self._status = None
+                self._no_poses = record.no_poses
             elif isinstance(record, Setup):
                 self._setup = record
+                self._no_poses = record.no_poses
                 self._static_transforms.publish(TFMessage(transforms=self._static()))
             elif isinstance(record, Status):
-                self._status = record
+                self._status, self._status_ns = record, self._arrived_ns
+                self._no_poses = record.no_poses
 
     def _take_pose(self, pose: Pose) -> None:
         live = pose.kind in ("predicted", "interpolated")
@@ -103,7 +127,7 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
             return
         self._pose = pose
         position, orientation = pose.position_m, pose.orientation_xyzw
-        stale = self._stale(pose)
+        stale = self._came_stale = pose.age_s() > self._max_age_s(pose)
         self._stale_poses += stale
         if not pose.valid or stale or position is None or orientation is None:
             return
@@ -126,8 +150,18 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
             _set_xyz(odometry.twist.twist.angular, pose.angular_velocity_radps)
             self._odometry.publish(odometry)
 
-    def _stale(self, pose: Pose) -> bool:
-        return pose.age_s() > default_max_age_s(pose, None if self._setup is None else self._setup.lag_s)
+    def _max_age_s(self, pose: Pose) -> float:
+        """Return the age on arrival from which a pose is stale."""
+        return default_max_age_s(pose, None if self._setup is None else self._setup.lag_s)
+
+    def _next_due_s(self, pose: Pose) -> float:
+        """Return the age from which the newest pose is stale, because the next one should have come."""
+        setup, limit_s = self._setup, self._max_age_s(pose)
+        if setup is None or setup.rate_hz <= 0:
+            return limit_s
+        if pose.kind == "interpolated":  # waits for the next measurement of each prism
+            limit_s += setup.limits.outage_s
+        return limit_s + LATE_PERIODS / setup.rate_hz
 
     def _take_measurement(self, measurement: Measurement) -> None:
         point = None if self._setup is None else measured_point(measurement, self._setup)
@@ -174,20 +208,32 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
 
     def _publish_diagnostics(self) -> None:
         with self._lock:
-            silent_s = (monotonic_ns() - self._arrived_ns) / 1e9
+            now_ns = monotonic_ns()
+            silent_s = (now_ns - self._arrived_ns) / 1e9
             why = "no connection yet" if self.stream is None else self.stream.problem
             if not why and silent_s > STREAM_SILENT_S:
                 why = f"no line for {silent_s:.0f} s" if self._arrived_ns else "no line yet"
-            statuses = [_stream_diagnosis(self.source, why)]
-            if self._pose is not None:
-                statuses.append(_pose_diagnosis(self._pose, self._stale_poses, stale=self._stale(self._pose)))
+            statuses = [_stream_diagnosis(self.source, why), self._pose_diagnosis()]
             if self._status is not None:
-                statuses += [_station_diagnosis(station) for station in self._status.stations]
+                status_age_s = (now_ns - self._status_ns) / 1e9
+                statuses += [_station_diagnosis(station, status_age_s) for station in self._status.stations]
+            began = self._arrived_ns > 0
         if why:
             for status in statuses[1:]:
-                status.level, status.message = DiagnosticStatus.STALE, "the stream has stopped"
+                status.level = DiagnosticStatus.STALE
+                status.message = "the stream has stopped" if began else status.message
         header = Header(stamp=self.get_clock().now().to_msg())
         self._diagnostics.publish(DiagnosticArray(header=header, status=statuses))
+
+    def _pose_diagnosis(self) -> Any:
+        pose = self._pose
+        if pose is None:
+            message = f"no poses: {self._no_poses}" if self._no_poses else "no pose yet"
+            return _diagnosis(
+                "pose", DiagnosticStatus.ERROR, message, series=self._series, stale_poses=self._stale_poses
+            )
+        stale = self._came_stale or pose.age_s() > self._next_due_s(pose)
+        return _pose_diagnosis(pose, self._stale_poses, stale=stale)
 
     def _time(self, stamp_ns: int, age_s: float) -> Any | None:
         if self._stamp == "local":
@@ -269,26 +315,50 @@ def _pose_diagnosis(pose: Pose, stale_poses: int, *, stale: bool) -> Any:
     )
 
 
-def _station_diagnosis(station: Any) -> Any:
-    if station.answering is False:
-        level, message = DiagnosticStatus.ERROR, "no answer over the radio"
-    elif station.status not in (None, "ok", "low_accuracy"):
-        level, message = DiagnosticStatus.WARN, station.status
-    elif station.locked is False:
-        level, message = DiagnosticStatus.WARN, "does not track its prism"
-    else:
-        level, message = DiagnosticStatus.OK, "measures"
+def _station_diagnosis(station: StationStatus, status_age_s: float) -> Any:
+    level, message = _station_condition(station)
+    if status_age_s > STATUS_SILENT_S:
+        level, message = DiagnosticStatus.STALE, f"no status for {status_age_s:.0f} s"
+    elif action := _action_required(station):
+        message = action if level == DiagnosticStatus.OK else f"{message}; {action}"
+        level = max(level, DiagnosticStatus.WARN)
     return _diagnosis(
         f"station {station.id}",
         level,
         message,
         rate_hz=station.rate_hz,
         age_s=station.age_s,
+        last_heard_s=station.last_heard_s,
         loss=station.loss,
         rssi_dbm=station.rssi_dbm,
         snr_db=station.snr_db,
         clock_bound_ns=station.clock_bound_ns,
+        battery_percent=station.battery_percent,
     )
+
+
+def _station_condition(station: StationStatus) -> tuple[bytes, str]:
+    """Return level and message, by what the master receives from a station."""
+    heard_s = station.last_heard_s
+    if heard_s is None:
+        return DiagnosticStatus.ERROR, "not received yet"
+    if heard_s > MAX_AGE_S and (not station.answering or heard_s > MAX_UNASKED_S):
+        return DiagnosticStatus.ERROR, f"silent for {heard_s:.0f} s"
+    if station.status is None or station.age_s is None:
+        return DiagnosticStatus.WARN, "no measurement yet"
+    if station.status not in ("ok", "low_accuracy"):
+        return DiagnosticStatus.WARN, UNUSABLE.get(station.status, station.status)
+    if station.age_s - heard_s > MAX_AGE_S:
+        return DiagnosticStatus.WARN, f"no measurement for {station.age_s:.0f} s"
+    return DiagnosticStatus.OK, "measures"
+
+
+def _action_required(station: StationStatus) -> str:
+    """Return what the operator has to do at a station although it may measure; empty for nothing."""
+    charge = station.battery_percent
+    if not station.problem and charge is not None and charge < LOW_BATTERY_PERCENT:
+        return f"battery {charge} %"
+    return station.problem or ""
 
 
 def main() -> int:

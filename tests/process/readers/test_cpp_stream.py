@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
+import re
 import shutil
 import socket
 import subprocess
 import time
+from asyncio.subprocess import PIPE
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import pytest
-from harness.files.records import EVENT, HELLO, NO_POSE, POSE, SETUP
+from harness.files.records import EVENT, HELLO, NO_POSE, POSE, SETUP, STATUS
 from harness.files.stream_lines import lines, serving
 from harness.missions.processes import ROOT, TIMEOUT_S, Program, free_port
 from harness.readers.network import PERIOD_NS, TSGT, Master
 
+from tsgt.client.records import monotonic_ns
+from tsgt.client.source import read_key_file
 from tsgt.radio.key_file import write_key
 from tsgt.recording import encode_line
+from tsgt.relay.admission import MAX_READERS
+from tsgt.relay.buffer import LineBuffer
+from tsgt.relay.server import RelayServer
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from tsgt.recording import PoseRecord, StatusRecord
 
 FOLDER = ROOT / "integrations" / "cpp"
 GXX = shutil.which("g++") or ""
@@ -43,7 +54,11 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Compile the example."""
     path = tmp_path_factory.mktemp("cpp") / "print_poses"
     warnings = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
-    command = [GXX, "-std=c++17", "-O1", *warnings, "-o", str(path), str(FOLDER / "print_poses.cpp")]
+    # A signed overflow ends the program; so it does without the sanitizer's library.
+    undefined = ("-fsanitize=undefined", "-fsanitize-undefined-trap-on-error")
+    command = [
+        GXX, "-std=c++17", "-O1", *warnings, *undefined, "-o", str(path), str(FOLDER / "print_poses.cpp"),
+    ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return path
@@ -268,6 +283,83 @@ def test_gaps_events_and_reasons_are_told(program: Path, tmp_path: Path) -> None
     ]
 
 
+LARGEST = 2**63 - 1
+
+
+@pytest.mark.parametrize("stamps", [(-LARGEST - 1,), (-LARGEST, LARGEST), (-LARGEST, 0, LARGEST, -LARGEST)])
+def test_absurd_times_are_no_overflow(program: Path, tmp_path: Path, stamps: tuple[int, ...]) -> None:
+    """What does not fit is a gap, as in Python; a time that fits only by a hair leaves the program running."""
+    now_ns = time.time_ns()
+    unusable = 2 if stamps == (-LARGEST - 1,) else 0
+    smoothed = replace(POSE, kind="smoothed")  # dated by the lines before, and not printed
+    absurd = [_stamped(record, stamp) for stamp in stamps for record in (STATUS, smoothed)]
+    now = [_stamped(record, now_ns) for record in (STATUS, replace(POSE, kind="predicted"))]
+    sent = (HELLO, *absurd, HELLO, *now)
+    with serving(tmp_path / "s", lines(*sent)), printing(program, tmp_path, str(tmp_path / "s")) as example:
+        example.wait_for_lines(3 + unusable)
+        found = example.output.read_text().splitlines()
+    assert found[1 : 1 + unusable] == unusable * ["gap 1 a line cannot be used: a time beyond 64 bits"]
+    last = found[2 + unusable]
+    assert last.startswith(f"pose {now_ns} ")
+    assert float(last.split("age ")[1].split()[0]) < TIMEOUT_S
+
+
+def _stamped(record: PoseRecord | StatusRecord, stamp_ns: int) -> bytes:
+    """Return a line with a time that our own records may not have."""
+    return re.sub(rb'"stamp_ns":\d+', b'"stamp_ns":%d' % stamp_ns, encode_line(record), count=1)
+
+
+@pytest.mark.parametrize("number", [b"010", b"-01", b".5", b"1.", b"1e", b"-", b"+1", b"1-1"])
+def test_what_is_no_number_is_a_gap(program: Path, tmp_path: Path, number: bytes) -> None:
+    """As in Python."""
+    line = b'{"type":"weather","x":[0,-0.5e+1,1E5,%s]}' % number
+    good = b'{"type":"weather","x":[0,-0,10,-0.5e+1,1E5,-12]}'
+    with (
+        serving(tmp_path / "s", lines(HELLO, good, line)),
+        printing(program, tmp_path, str(tmp_path / "s")) as example,
+    ):
+        example.wait_for_lines(2)
+        found = example.output.read_text().splitlines()
+    assert found[1] == "gap 1 a line cannot be used: not JSON"
+
+
+KINDS = """
+#include <cstdio>
+#include "tsgt_stream.hpp"
+int main(int, char** argv) {
+  tsgt::Stream stream(argv[1]);
+  std::string last;
+  while (last != "interpolated") {
+    const auto* pose = stream.latest(1e9);
+    if (pose != nullptr && pose->kind != last) std::puts((last = pose->kind).c_str());
+    poll(nullptr, 0, 5);
+  }
+}
+"""
+
+
+def test_latest_pose_is_of_a_known_kind(tmp_path: Path) -> None:
+    """What a later version of the master adds may be anything, such as a pose of the future."""
+    (tmp_path / "kinds.cpp").write_text(KINDS)
+    command = [
+        GXX, "-std=c++17", "-I", str(FOLDER), "-o", str(tmp_path / "kinds"), str(tmp_path / "kinds.cpp"),
+    ]  # fmt: skip
+    subprocess.run(command, check=True)
+    forecast = encode_line(AWKWARD).replace(b'"predicted"', b'"forecast"')
+    smoothed, interpolated = replace(AWKWARD, kind="smoothed"), replace(AWKWARD, kind="interpolated")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(tmp_path / "s"))
+        listener.listen()
+        with Program([tmp_path / "kinds", tmp_path / "s"], tmp_path, "kinds") as program:
+            connection, _ = listener.accept()
+            with connection:
+                for sent in ((HELLO, AWKWARD), (forecast, smoothed), (interpolated,)):
+                    connection.sendall(lines(*sent))
+                    time.sleep(0.3)
+            assert program.ended() == 0
+    assert program.output.read_text().split() == ["predicted", "interpolated"]
+
+
 @pytest.mark.parametrize(
     ("data", "error"),
     [
@@ -331,3 +423,34 @@ def test_wrong_key_gets_nothing(program: Path, tmp_path: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
     assert (done.returncode, done.stdout) == (1, "")
     assert "the relay has another key" in done.stderr
+
+
+def test_reader_waits_for_a_place_at_a_full_relay(program: Path, tmp_path: Path) -> None:
+    """It is told so, and not that its key is wrong; once there is a place it has the greeting and every line since."""
+    write_key(key := tmp_path / "relay.key")
+    buffer = LineBuffer("ab" * 16, read_key_file(key), max_bytes=1 << 20, max_age_ns=10**12)
+
+    async def main() -> str:
+        async with RelayServer(
+            "127.0.0.1", 0, read_key_file(key), buffer, tls=None, now_ns=monotonic_ns
+        ) as server:
+            server.line(encode_line(HELLO))
+            server.readers |= (crowd := {Mock() for _ in range(MAX_READERS)})
+            command = (str(program), f"relay://127.0.0.1:{server.port}", str(key))
+            example = await asyncio.create_subprocess_exec(*command, stdout=PIPE, stderr=PIPE)
+            assert example.stdout is not None
+            assert example.stderr is not None
+            assert b"hello" in await asyncio.wait_for(example.stdout.readline(), TIMEOUT_S)
+            for number in range(3):
+                server.line(encode_line(replace(AWKWARD, stamp_ns=AWKWARD.stamp_ns + number * PERIOD_NS)))
+                await asyncio.sleep(0.2)  # some attempts
+            server.readers -= crowd
+            for number in range(3):
+                line = await asyncio.wait_for(example.stdout.readline(), TIMEOUT_S)
+                assert int(line.split()[1]) == AWKWARD.stamp_ns + number * PERIOD_NS
+            example.kill()
+            return (await example.stderr.read()).decode()
+
+    problems = asyncio.run(main()).splitlines()
+    assert len(problems) == 1
+    assert problems[0].endswith("the relay has too many readers")

@@ -5,18 +5,20 @@ from __future__ import annotations
 import asyncio
 import socket
 import subprocess
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import asynccontextmanager, closing, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 from harness.files.records import HELLO, POSE, SETUP
 
-from tsgt.client import AsyncStream, AuthenticationError, Event, Gap, Hello, Pose, Setup, pump
+from tsgt.client import AsyncStream, AuthenticationError, Event, Gap, Hello, Pose, Setup, pump, relay_wire
 from tsgt.client.records import monotonic_ns
 from tsgt.client.tls import relay_context
+from tsgt.errors import StreamError
 from tsgt.recording import encode_line
-from tsgt.relay.admission import MAX_PENDING_OF_ADDRESS
+from tsgt.relay import server as relay_server
+from tsgt.relay.admission import ATTEMPTS, MAX_PENDING_OF_ADDRESS
 from tsgt.relay.buffer import LineBuffer
 from tsgt.relay.server import RelayServer
 
@@ -257,6 +259,160 @@ def test_long_resumption_overflows_no_queue() -> None:
                 server.line(b'{"type":"event","stamp_ns":%d,"event":"e","message":""}' % number)
             found = await asyncio.wait_for(taken(stream, count), 10)
         assert [record.stamp_ns for record in found if isinstance(record, Event)] == list(range(count))
+
+    asyncio.run(main())
+
+
+@pytest.fixture
+def one_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a relay have one reader."""
+    monkeypatch.setattr(relay_server, "MAX_READERS", 1)
+
+
+async def told(stream: AsyncStream, problem: str) -> None:
+    """Return when a stream has a problem."""
+    async with asyncio.timeout(5):
+        while problem not in stream.problem:  # noqa: ASYNC110 (it has no event for it)
+            await asyncio.sleep(0.001)
+
+
+@pytest.mark.usefixtures("one_place")
+@pytest.mark.parametrize("scheme", ["relay", "relays"])
+def test_reader_waits_for_a_place(certificate: tuple[ssl.SSLContext, str], scheme: str) -> None:
+    """A full relay tells it so, and not that its key is wrong; once there is a place it gets every line since."""
+
+    async def main() -> None:
+        async with relay(certificate if scheme == "relays" else None) as server:
+            source = f"{scheme}://{LOOPBACK}:{server.port}"
+            async with AsyncStream(source, key=KEY) as waiting:
+                async with AsyncStream(source, key=KEY) as first:
+                    await asyncio.wait_for(taken(first, 2), 5)
+                    reading = asyncio.create_task(taken(waiting, 5))
+                    await told(waiting, "too many readers")
+                    for number in range(2):
+                        server.line(pose_line(number))
+                    await asyncio.sleep(0.5)  # some attempts
+                    assert not reading.done()
+                    assert "too many readers" in waiting.problem
+                await readers(server, 1)
+                server.line(pose_line(2))
+                found = await asyncio.wait_for(reading, 5)
+                assert waiting.problem == ""
+        assert [type(record) for record in found] == [Hello, Setup, Pose, Pose, Pose]
+
+    asyncio.run(main())
+
+
+@pytest.mark.usefixtures("one_place")
+def test_full_relay_costs_no_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader whose place was taken while it was away resumes once there is another."""
+
+    async def main() -> None:
+        async with relay() as server, AsyncStream(f"relay://{LOOPBACK}:{server.port}", key=KEY) as stream:
+            await asyncio.wait_for(taken(stream, 2), 5)
+            monkeypatch.setattr(relay_server, "MAX_READERS", 0)
+            for reader in list(server.readers):
+                reader.abort()
+            server.line(pose_line(0))
+            await told(stream, "too many readers")
+            server.line(pose_line(1))
+            monkeypatch.setattr(relay_server, "MAX_READERS", 1)
+            found = await asyncio.wait_for(taken(stream, 2), 5)
+        stamps = [record.stamp_ns for record in found if isinstance(record, Pose)]
+        assert stamps == [POSE.stamp_ns, POSE.stamp_ns + 50_000_000]
+
+    asyncio.run(main())
+
+
+def test_long_wait_for_a_place_is_one_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not one at each attempt."""
+    count = 400
+
+    async def main() -> None:
+        async with (
+            relay(max_bytes=20_000) as server,
+            AsyncStream(f"relay://{LOOPBACK}:{server.port}", key=KEY) as stream,
+        ):
+            await asyncio.wait_for(taken(stream, 2), 5)
+            monkeypatch.setattr(relay_server, "MAX_READERS", 0)
+            for reader in list(server.readers):
+                reader.abort()
+            reading = asyncio.create_task(taken(stream, 4))
+            for number in range(count):
+                server.line(pose_line(number))
+                await asyncio.sleep(0.001)
+            monkeypatch.setattr(relay_server, "MAX_READERS", 1)
+            found = await asyncio.wait_for(reading, 5)
+        assert [type(record) for record in found] == [Gap, Hello, Setup, Pose]
+        gap, pose = found[0], found[-1]
+        assert isinstance(gap, Gap)
+        assert isinstance(pose, Pose)
+        assert gap.lines == (pose.stamp_ns - POSE.stamp_ns) // 50_000_000
+
+    asyncio.run(main())
+
+
+@pytest.mark.usefixtures("one_place")
+def test_full_relay_is_a_failure_without_reconnection() -> None:
+    """And not the end of the stream."""
+
+    async def main() -> None:
+        async with relay() as server:
+            source = f"relay://{LOOPBACK}:{server.port}"
+            async with (
+                AsyncStream(source, key=KEY) as first,
+                AsyncStream(source, key=KEY, reconnect=False) as second,
+            ):
+                await asyncio.wait_for(taken(first, 2), 5)
+                with pytest.raises(StreamError, match="too many readers"):
+                    await asyncio.wait_for(taken(second, 3), 5)
+
+    asyncio.run(main())
+
+
+@pytest.mark.usefixtures("one_place")
+def test_attempts_at_a_full_relay_are_limited() -> None:
+    """Readers of an earlier version do not know why the connection ends, and try again at once."""
+
+    async def attempt(port: int) -> bytes:
+        reader, writer = await asyncio.open_connection(LOOPBACK, port)
+        with suppress(ConnectionResetError), closing(writer):
+            if challenge := (await reader.readline()).decode().rstrip("\n"):
+                request = relay_wire.request(KEY, relay_wire.NO_CHANNEL, challenge, bytes(32), None)
+                writer.write(request.encode() + b"\n")
+                return await asyncio.wait_for(reader.read(), 5)
+        return b""
+
+    async def main() -> None:
+        async with relay() as server, AsyncStream(f"relay://{LOOPBACK}:{server.port}", key=KEY) as first:
+            await asyncio.wait_for(taken(first, 2), 5)
+            answers = [await attempt(server.port) for _ in range(3 * ATTEMPTS)]
+        assert answers[0].count(b"\n") == 2 + len(GREETING)
+        assert sum(map(bool, answers)) < 2 * ATTEMPTS
+
+    asyncio.run(main())
+
+
+def test_busy_relay_that_is_then_off_has_no_other_key() -> None:
+    """One connection that ends at the proof, and others that are refused, prove nothing."""
+
+    async def main() -> None:
+        with socket.create_server((LOOPBACK, 0)) as listener:
+            port = listener.getsockname()[1]
+            stream = AsyncStream(f"relay://{LOOPBACK}:{port}", key=KEY)
+            async with stream:
+                reading = asyncio.create_task(taken(stream, 1))
+                await asyncio.sleep(0.05)
+                connection, _ = listener.accept()
+                listener.close()
+                connection.sendall(relay_wire.challenge(bytes(32)).encode() + b"\n")
+                await asyncio.sleep(0.05)
+                assert connection.recv(512)
+                connection.close()
+                await told(stream, "refused")
+                await asyncio.sleep(0.5)
+                assert not reading.done()
+                reading.cancel()
 
     asyncio.run(main())
 

@@ -34,6 +34,25 @@ RETRY_DELAYS_S = (5.0, 30.0)  # a web server is tried again after these; mobile 
 log = structlog.get_logger()
 
 
+_STATES = (
+    {"station_lost", "station_recovered"},
+    {"station_idle", "station_measuring"},
+    {"station_not_tracking", "station_tracking"},
+    {"battery_low", "battery_recovered"},
+    {"radio_failed", "radio_recovered"},
+    {"disk_low", "disk_full", "disk_failed", "disk_recovered"},
+    {"imu_setup_wrong", "imu_setup_confirmed"},
+    {"imu_lost", "imu_recovered"},
+    {"imu_implausible", "imu_plausible"},
+    {"imu_used", "imu_not_used"},
+    {"odometry_lost", "odometry_recovered"},
+    {"odometry_disagrees", "odometry_agrees"},
+    {"geofence_exited", "geofence_entered"},
+    {"layout_residual_high", "layout_residual_normal"},
+)
+"""Events that replace each other: what begins a state, what changes and what ends it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Alarm:
     """An event that leaves the machine; ``suppressed``: how many of its kind were held back before it."""
@@ -59,8 +78,8 @@ class _Subject:
 class AlarmLimiter:
     """Passes an alarm of each kind and subject at most once per interval.
 
-    Those in between are held back, and the newest of them passes at the end of the interval: the last alarm that somebody
-    got describes the state that lasts.
+    Those in between are held back, and the newest of them passes at the end of the interval, unless another event has replaced it:
+    the last alarm that somebody got describes the state that lasts.
     """
 
     def __init__(self, events: Iterable[str], min_interval_ns: int) -> None:
@@ -70,20 +89,30 @@ class AlarmLimiter:
 
     def take(self, event: EventRecord, now_ns: int) -> list[Alarm]:
         """Take any event of the master; return it as an alarm if it is one and may pass now."""
-        if event.event not in self._events:
-            return []
         _, is_fence, change = event.event.partition(
             "geofence_"
         )  # its message begins with "geofence NAME CHANGE:"
         name = event.message.partition(f" {change}:")[0] if is_fence else ""
+        self._drop_replaced(event, name)
+        if event.event not in self._events:
+            return []
         key = (event.event, event.station, name)
         subject = self._subjects.get(key)
         if subject is None or (subject.held is None and now_ns >= subject.next_ns):
             self._subjects[key] = _Subject(now_ns + self._min_interval_ns)
-            return [Alarm(event)]
+            return [Alarm(event, 0 if subject is None else subject.suppressed)]
         subject.suppressed += subject.held is not None
         subject.held = event
         return []
+
+    def _drop_replaced(self, event: EventRecord, name: str) -> None:
+        """Drop what is held back of a state that an event changes."""
+        state: set[str] = next((each for each in _STATES if event.event in each), set())
+        for (other, station, other_name), subject in self._subjects.items():
+            same = other_name == name and (station == event.station or None in (station, event.station))
+            if other in state and other != event.event and same and subject.held is not None:
+                subject.held = None
+                subject.suppressed += 1
 
     def due(self, now_ns: int) -> list[Alarm]:
         """Return the alarms that were held back until now, in their order."""

@@ -139,6 +139,8 @@ class Publisher:
             case link_events.LinkDelayAnomaly(station):
                 self.put(detector.link_delay_anomaly(station, now_ns))
             case link_events.MasterEvent(name, message):
+                if name == "radio_failed":
+                    statistics.radio_failed()
                 self.put(EventRecord(stamp_ns=now_ns, event=name, message=message))
 
     def publish_status(

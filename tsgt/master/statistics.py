@@ -42,7 +42,14 @@ class Statistics:
 
     def exchange(self, station: int, *, responded: bool) -> None:
         """Count a request to a station, or a slot of it."""
-        self._stations[station].responses.append(responded)
+        found = self._stations[station]
+        found.responses.append(responded)
+        found.answering = responded
+
+    def radio_failed(self) -> None:
+        """Record that no station can be asked."""
+        for station in self._stations.values():
+            station.answering = None if station.answering is None else False
 
     def packet(self, station: int, now_ns: int, *, rssi_dbm: float, snr_db: float) -> None:
         """Record the reception of a station's packet."""
@@ -125,6 +132,7 @@ class _Station:
     received_ns: int | None = None
     rssi_dbm: float | None = None
     snr_db: float | None = None
+    answering: bool | None = None
     responses: deque[bool] = field(default_factory=lambda: deque(maxlen=LOSS_WINDOW_EXCHANGES))
     arrivals_ns: deque[int] = field(default_factory=deque)
     first_ns: int = 0
@@ -150,7 +158,7 @@ class _Station:
             prism=self.prism,
             locked=None if self.status is None else self.status.has_target,
             last_heard_s=_age_s(self.received_ns, now_ns),
-            answering=self.responses[-1] if self.responses else None,
+            answering=self.answering,
             rate_hz=self._rate_hz(now_ns),
             loss=1 - sum(self.responses) / len(self.responses) if self.responses else None,
             rssi_dbm=self.rssi_dbm,

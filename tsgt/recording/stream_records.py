@@ -254,7 +254,7 @@ class StationStatus(FiniteNumbers):
     locked: bool | None = None
     """Whether it had a target at its last measurement; null before the first one."""
     answering: bool | None = None
-    """Whether it responded to the last request; null before the first one."""
+    """Whether it responded to the last request; null before the first one, false while the master's radio fails."""
     last_heard_s: float | None = None
     """Age of its last radio packet in s; null before the first one."""
     rate_hz: float | None = None

@@ -74,6 +74,42 @@ def test_subjects_do_not_suppress_each_other() -> None:
     assert limit.take(replace(EXITED, message="geofence yard exited: 3 m beyond"), 0) == []
 
 
+@pytest.mark.parametrize("events", [["station_lost"], ["station_lost", "station_recovered"]])
+def test_last_alarm_is_of_the_state_that_lasts(events: list[str]) -> None:
+    """What is held back of a state that has ended is never sent; the next of its kind counts it."""
+    limit = AlarmLimiter(events, 60 * SECOND)
+    sent: list[tuple[int, str, int | None]] = []
+    happened = {
+        0: "lost",
+        5: "recovered",
+        60: "lost",
+        61: "recovered",
+        62: "lost",
+        64: "recovered",
+        300: "lost",
+    }
+    for second in range(400):
+        alarms = limit.due(second * SECOND)
+        if second in happened:
+            event = replace(LOST, event=f"station_{happened[second]}", stamp_ns=second * SECOND)
+            alarms += limit.take(event, second * SECOND)
+        sent += [(second, each.event.event, each.suppressed) for each in alarms]
+    lost = [each for each in sent if each[1] == "station_lost"]
+    assert lost == [(0, "station_lost", 0), (60, "station_lost", 0), (300, "station_lost", 1)]
+    recovered = [second for second, name, _ in sent if name == "station_recovered"]
+    assert recovered == ([5, 65] if len(events) > 1 else [])
+
+
+def test_what_ends_a_state_names_no_station_where_it_concerns_all() -> None:
+    """The residual of the layout is high because of one station, and normal again for all."""
+    limit = AlarmLimiter(["layout_residual_high"], 60 * SECOND)
+    high = replace(LOST, event="layout_residual_high")
+    assert limit.take(high, 0) == [Alarm(high)]
+    assert limit.take(high, 10 * SECOND) == []
+    assert limit.take(replace(high, event="layout_residual_normal", station=None), 20 * SECOND) == []
+    assert limit.due(100 * SECOND) == []
+
+
 def test_alarm_is_the_line_of_the_event_with_the_site() -> None:
     """Whatever the name of the site."""
     line = json.loads(Alarm(LOST, suppressed=3).line('Steinbruch "Süd"\n'))

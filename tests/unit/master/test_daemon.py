@@ -476,6 +476,7 @@ async def test_failed_radio_is_reopened(tmp_path: Path) -> None:
             works = False
             await asyncio.sleep(15)
             assert events(field) == ["radio_failed"]
+            assert not any(station.answering for station in field.of(StatusRecord)[-1].stations)
             works = True
             await asyncio.sleep(15)
             assert events(field) == ["radio_failed", "radio_recovered"]

@@ -52,6 +52,16 @@ def test_age_of_the_last_target_check() -> None:
     assert (first.last_target_check_age_s, second.last_target_check_age_s) == (None, 2.0)
 
 
+def test_no_station_answers_while_the_radio_fails() -> None:
+    """Until one responds again; one that was never asked is unknown."""
+    statistics = Statistics([1, 2])
+    statistics.exchange(1, responded=True)
+    statistics.radio_failed()
+    assert [each.answering for each in statistics.status(SECOND).stations] == [False, None]
+    statistics.exchange(1, responded=True)
+    assert statistics.status(SECOND).stations[0].answering
+
+
 def test_unknown_station_is_ignored() -> None:
     """Unknown station is ignored."""
     statistics = Statistics([1])

@@ -123,7 +123,7 @@ def _client_status(path: Path) -> ClientStatus | None:
     from tsgt.cli.live.status import status_of
     from tsgt.station import ClientStatus
 
-    record, _ = status_of(path)
+    record = status_of(path).record
     return record if isinstance(record, ClientStatus) else None
 
 

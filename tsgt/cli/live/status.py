@@ -6,7 +6,7 @@ import contextlib
 import shutil
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
@@ -18,14 +18,19 @@ from tsgt.cli.options import DEFAULT_CLIENT_SOCKET, DEFAULT_SOCKET, path_type
 from tsgt.cli.output import CHECK_FAILED, printable
 from tsgt.cli.render import clock_time, render
 from tsgt.errors import StreamError
-from tsgt.recording import HelloRecord, StatusRecord, Typed, decode
+from tsgt.recording import PoseRecord, StatusRecord, Typed, decode
 from tsgt.station import ClientStatus
+from tsgt.web.mission import MissionState
+from tsgt.web.mission.verdict import Level
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 TIMEOUT_S = 5.0
 """A master sends its status each second; one that sends none for this long is stuck."""
+
+MAX_POSE_WAIT_S = 1.5
+"""A master sends the next status within a second; if no live pose has come until then, there is none."""
 
 
 @click.command()
@@ -61,9 +66,12 @@ def status(socket_path: Path | None, *, as_json: bool, watch: bool) -> int:
             else:
                 _show_screen(follower)
         return 0
-    record, line = _request(socket_path)
-    text, ok = client_text(record) if isinstance(record, ClientStatus) else master_text(record)
-    click.echo(line.rstrip() if as_json else "\n".join(text))
+    answer = _request(socket_path)
+    record = answer.record
+    text, ok = (
+        client_text(record) if isinstance(record, ClientStatus) else master_text(record, answer.no_pose)
+    )
+    click.echo(answer.line.rstrip() if as_json else "\n".join(text))
     return 0 if ok else CHECK_FAILED
 
 
@@ -107,7 +115,7 @@ def _text_line(kind: str, line: bytes) -> str:
     return printable(render(kind, line) or "")
 
 
-def _request(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, bytes]:
+def _request(socket_path: Path | None) -> Answer:
     """Read the status from the given socket, else from the default of a master, then of a client."""
     if socket_path is not None:
         return status_of(socket_path)
@@ -120,25 +128,48 @@ def _request(socket_path: Path | None) -> tuple[StatusRecord | ClientStatus, byt
     )
 
 
-def status_of(path: Path) -> tuple[StatusRecord | ClientStatus, bytes]:
-    """Wait for the first status line on a socket."""
+class Answer(NamedTuple):
+    """A daemon's status, its line, and of a master why there is no valid pose now; empty if there is one."""
+
+    record: StatusRecord | ClientStatus
+    line: bytes
+    no_pose: str = ""
+
+
+def status_of(path: Path) -> Answer:
+    """Wait for the first status on a socket, and with a master for a live pose or the next status."""
     until_s = time.monotonic() + TIMEOUT_S  # for the status, not for each line
+    mission = MissionState(str(path))
+    mission.connected(time.monotonic())
+    found: Answer | None = None
+    pose_seen = False
     try:
         with connect(path, TIMEOUT_S) as reader:
             while line := reader.line(until_s):
-                match decode(Typed, line).type:
-                    case "status":
-                        return decode(StatusRecord, line), line
-                    case "client_status":
-                        return decode(ClientStatus, line), line
-                    case "hello":
-                        decode(HelloRecord, line)
+                now_s, kind = time.monotonic(), decode(Typed, line).type
+                if kind == "client_status":
+                    return Answer(decode(ClientStatus, line), line)
+                try:
+                    mission.line(line, now_s)
+                    pose_seen |= kind == "pose" and decode(PoseRecord, line).kind != "smoothed"
+                except ValueError:  # another line that cannot be read is one less
+                    if kind in ("hello", "status"):
+                        raise
+                complete = found is not None and kind == "status"
+                if kind == "status":
+                    found, until_s = Answer(decode(StatusRecord, line), line), now_s + MAX_POSE_WAIT_S
+                if found is not None and (pose_seen or complete):
+                    break
     except TimeoutError as error:
-        raise StreamError(
-            f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
-        ) from error
+        if found is None:
+            raise StreamError(
+                f"{path}: no status within {TIMEOUT_S:g} s; the daemon is stuck, see its log"
+            ) from error
     except OSError as error:
         raise StreamError(f"{path}: no connection to a daemon ({error.strerror or error})") from error
     except ValueError as error:
         raise StreamError(f"{path}: not a stream of tsgt ({error})") from error
-    raise StreamError(f"{path}: the stream ended without a status; is it a replay?")
+    if found is None:
+        raise StreamError(f"{path}: the stream ended without a status; is it a replay?")
+    verdict = mission.findings_now(time.monotonic())[0]
+    return found._replace(no_pose=verdict.cause if verdict.level >= Level.NO_POSE else "")

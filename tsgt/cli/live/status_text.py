@@ -63,8 +63,11 @@ Block = list[str]
 """Lines of at most :data:`WIDTH` characters that belong together; the first is a headline."""
 
 
-def master_text(record: StatusRecord) -> tuple[list[str], bool]:
-    """Return a master's status in lines of at most 40 characters, and whether no action is required."""
+def master_text(record: StatusRecord, no_pose: str = "") -> tuple[list[str], bool]:
+    """Return a master's status in lines of at most 40 characters, and whether no action is required.
+
+    ``no_pose``: why there is no valid pose now; empty if there is one.
+    """
     head = [
         f"MASTER  {clock_time(record.stamp_ns)} UTC",
         f"poses {record.poses}, valid {record.valid_poses}",
@@ -73,13 +76,15 @@ def master_text(record: StatusRecord) -> tuple[list[str], bool]:
         head.append(f"frame {record.frame_ms:.0f} ms")
     if record.no_poses is not None:
         head += [_headline("NOT CALIBRATED: no poses", ok=False), *wrapped(printable(record.no_poses), "  ")]
+    elif no_pose:
+        head += [_headline("NO VALID POSE", ok=False), *wrapped(no_pose, "  ")]
     if record.protocol == "superframe" and not record.authenticated:
         head.append(_headline(NO_KEY, ok=False))
     blocks, problems = master_blocks(record)
     return [
         *head,
         *(line for block in blocks for line in ("", *block)),
-    ], not problems and record.valid_poses > 0
+    ], not problems and not no_pose and record.no_poses is None
 
 
 def master_blocks(record: StatusRecord) -> tuple[list[Block], list[str]]:

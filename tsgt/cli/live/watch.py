@@ -18,16 +18,14 @@ from tsgt.cli.output import printable
 from tsgt.cli.render import clock_time
 from tsgt.recording import EventRecord, PoseRecord, StatusRecord, Typed, decode
 from tsgt.station import ClientStatus
+from tsgt.web.mission import MissionState
+from tsgt.web.mission.verdict import POSE_AGE_LIMIT_S, Level
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from tsgt.cli.live.status_text import Block
 
 MAX_SILENCE_S = 3.0
-"""A master sends its status each second; without a line for this long the stream has stopped."""
-
-MAX_POSE_AGE_S = 1.0
+"""A client sends its status each second; without one for this long it has stopped."""
 
 MAX_EVENTS = 100
 
@@ -37,9 +35,13 @@ _COLOURS = {"GOOD": "green", "CARE": "yellow"}
 
 
 class Watch:
-    """Collects lines of a stream; instants are on the monotonic clock of this computer in s."""
+    """Collects lines of a stream; instants are on the monotonic clock of this computer in s.
+
+    The verdict on a master is that of the operator's page.
+    """
 
     def __init__(self) -> None:
+        self._mission = MissionState("stream")
         self.events: deque[str] = deque(maxlen=MAX_EVENTS)
         self._line_s: float | None = None
         self._status: StatusRecord | ClientStatus | None = None
@@ -51,6 +53,7 @@ class Watch:
         match decode(Typed, line).type:
             case "hello":  # another process, or another replay
                 self._status = self._pose = None
+                self._mission.connected(now_s)
             case "status":
                 self._status = decode(StatusRecord, line)
             case "client_status":
@@ -62,29 +65,27 @@ class Watch:
             case "event":
                 self.events.append(event_text(decode(EventRecord, line)))
         self._line_s = now_s
+        if not isinstance(self._status, ClientStatus):
+            self._mission.line(line, now_s)
 
     def verdict(self, now_s: float, problem: str) -> tuple[str, str]:
         """Return the verdict and its cause; ``problem``: why there is no connection, empty while there is one."""
-        status, pose = self._status, self._pose
         silence_s = None if self._line_s is None else now_s - self._line_s
         # A client sends its status and disconnects.
-        if problem and not (isinstance(status, ClientStatus) and (silence_s or 0.0) < MAX_SILENCE_S):
+        if problem and not (isinstance(self._status, ClientStatus) and (silence_s or 0.0) < MAX_SILENCE_S):
             return "NO CONNECTION", problem
         if silence_s is None:
             return "NO CONNECTION", "nothing has been received yet"
-        if silence_s > MAX_SILENCE_S:
-            return "STREAM STOPPED", f"nothing received for {duration(silence_s)}"
-        if isinstance(status, ClientStatus):
-            lines, ok = client_text(status)
+        if isinstance(self._status, ClientStatus):
+            if silence_s > MAX_SILENCE_S:
+                return "STREAM STOPPED", f"nothing received for {duration(silence_s)}"
+            lines, ok = client_text(self._status)
             return ("GOOD", "") if ok else ("CARE", click.unstyle(lines[0]))
-        if pose is None:
-            return "NO POSE", "none has been computed yet"
-        if now_s - self._pose_s > MAX_POSE_AGE_S:
-            return "NO POSE", f"none for {duration(now_s - self._pose_s)}"
-        if not pose.valid:
-            return "NO POSE", pose.reason.replace("_", " ")
-        problems = _problems(status, pose)
-        return ("CARE", "; ".join(problems)) if problems else ("GOOD", "")
+        verdict, *others = self._mission.findings_now(now_s)
+        if verdict.level is Level.GOOD:
+            return verdict.level.words, ""
+        causes = [verdict.cause, *(each.cause for each in others if each.level == verdict.level)]
+        return verdict.level.words, "; ".join(causes)
 
     def view(self, now_s: float, problem: str, *, width: int) -> tuple[list[str], list[Block]]:
         """Return headlines and blocks of the screen."""
@@ -105,22 +106,13 @@ class Watch:
             return [client_text(self._status)[0]]
         blocks, _ = master_blocks(self._status)
         poses = [f"poses {self._status.poses}, valid {self._status.valid_poses}"]
-        if self._pose is not None and now_s - self._pose_s <= MAX_POSE_AGE_S:
+        if self._pose is not None and now_s - self._pose_s <= POSE_AGE_LIMIT_S:
             poses = [*pose_block(self._pose), f"  {poses[0]}"]
+        if self._status.protocol == "superframe" and not self._status.authenticated:
+            poses.append(f"  {NO_KEY}")
         return [poses, *blocks]
 
 
 def event_text(event: EventRecord) -> str:
     """Return an event as one line."""
     return f"{clock_time(event.stamp_ns)[:8]} {event.event}: {event.message}"
-
-
-def _problems(status: StatusRecord | None, pose: PoseRecord) -> Sequence[str]:
-    """Return what requires care, the most urgent first."""
-    problems: list[str] = []
-    if status is not None:
-        problems += master_blocks(status)[1]
-    problems += [cause.replace("_", " ") for cause in pose.degraded_by]
-    if status is not None and status.protocol == "superframe" and not status.authenticated:
-        problems.append(NO_KEY)
-    return problems

@@ -290,7 +290,7 @@ class MissionState:
                 self._decode_newest()
             except ValueError:  # It is no pose: the one before stays, and ages
                 self._unreadable_s["pose"] = arrived_s
-        found = self._findings(now_s)
+        found = self.findings_now(now_s)
         shown = self._hold.update(found[0], now_s)
         others = [
             each for each in found if each.level is not Level.GOOD and not repeats(shown.cause, each.cause)
@@ -326,39 +326,8 @@ class MissionState:
             **(findings.storage_view(self._status, self._setup) if live else {}),
         }
 
-    def setup_view(self) -> dict[str, Any] | None:
-        """Return what the map shows of the set-up; None while it is unknown."""
-        setup = self._setup
-        if setup is None:
-            return None
-        return {
-            "frame": plain(setup.frame),
-            "child_frame": plain(setup.child_frame),
-            "estimator": plain(setup.estimator),
-            "stations": [
-                {"id": each.id, "at": [rounded(each.position_m[0], 2), rounded(each.position_m[1], 2)]}
-                for each in setup.stations
-            ],
-            "fences": [
-                {
-                    "name": plain(fence.name),
-                    "allowed_side": fence.allowed_side,
-                    "margin_m": fence.margin_m,
-                    "polygon": [[rounded(x, 2), rounded(y, 2)] for x, y in fence.polygon_m],
-                }
-                for fence in setup.geofences
-            ],
-        }
-
-    def _stream(self, now_s: float) -> StreamFacts:
-        return StreamFacts(
-            connected=self._connected,
-            problem=self._problem,
-            silence_s=now_s - self._line_s,
-            delay_s=self._delay_s,
-        )
-
-    def _findings(self, now_s: float) -> list[Finding]:
+    def findings_now(self, now_s: float) -> list[Finding]:
+        """Return everything that the operator has to know, the verdict first."""
         conditions = self._conditions(now_s)
         radio_failure = self._standing.radio_failure
         pose, limits = self._live, self._setup.limits if self._setup is not None else None
@@ -390,6 +359,38 @@ class MissionState:
             or findings.waiting_for(conditions)
         )
         return judge(self._stream(now_s), facts, waiting_for, others)
+
+    def setup_view(self) -> dict[str, Any] | None:
+        """Return what the map shows of the set-up; None while it is unknown."""
+        setup = self._setup
+        if setup is None:
+            return None
+        return {
+            "frame": plain(setup.frame),
+            "child_frame": plain(setup.child_frame),
+            "estimator": plain(setup.estimator),
+            "stations": [
+                {"id": each.id, "at": [rounded(each.position_m[0], 2), rounded(each.position_m[1], 2)]}
+                for each in setup.stations
+            ],
+            "fences": [
+                {
+                    "name": plain(fence.name),
+                    "allowed_side": fence.allowed_side,
+                    "margin_m": fence.margin_m,
+                    "polygon": [[rounded(x, 2), rounded(y, 2)] for x, y in fence.polygon_m],
+                }
+                for fence in setup.geofences
+            ],
+        }
+
+    def _stream(self, now_s: float) -> StreamFacts:
+        return StreamFacts(
+            connected=self._connected,
+            problem=self._problem,
+            silence_s=now_s - self._line_s,
+            delay_s=self._delay_s,
+        )
 
     def _conditions(self, now_s: float) -> dict[int, stations.Condition]:
         if self._status is None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 import pytest
-from harness.files.records import IMU_STATUS, ODOMETRY_STATUS
+from harness.files.records import IMU_STATUS, ODOMETRY_STATUS, POSE
 from harness.files.stream_lines import serving
 
 from tsgt.cli.live.status_text import client_text, duration, master_text, station_label
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from harness.files.cli import Tsgt
+
+    from tsgt.recording import PoseRecord
 
 NOW_NS = 1_700_000_000_000_000_000
 WIDTH = 40
@@ -92,6 +94,8 @@ CLIENT = ClientStatus(
     refused=0,
     clock_bound_ns=80_000,
 )
+
+LIVE = dataclasses.replace(POSE, kind="predicted", quality="good")
 
 
 def test_master_without_problems() -> None:
@@ -352,12 +356,44 @@ def _serve(path: Path, *lines: bytes) -> threading.Thread:
 
 
 def test_master_status_is_read_from_the_stream(tsgt: Tsgt, tmp_path: Path) -> None:
-    """Other records before the status are skipped."""
-    serving = _serve(tmp_path / "s", encode_line(HelloRecord()), b'{"type":"pose"}', encode_line(MASTER))
+    """Other records before the status are skipped, also such as cannot be read."""
+    lines = (encode_line(HelloRecord()), b'{"type":"pose"}', encode_line(LIVE), encode_line(MASTER))
+    serving = _serve(tmp_path / "s", *lines)
     outcome = tsgt("status", "--socket", tmp_path / "s")
     serving.join()
     assert outcome.code == 0, outcome.err
     assert outcome.out.startswith("MASTER  22:13:20")
+
+
+@pytest.mark.parametrize(
+    ("poses", "cause"),
+    [
+        ([dataclasses.replace(LIVE, valid=False, reason="residual")], "the prisms miss their layout"),
+        ([dataclasses.replace(LIVE, kind="smoothed", delay_s=1.0)], "no pose yet"),
+        ([], "no pose yet"),
+    ],
+)
+def test_pose_that_is_invalid_now_fails(
+    tsgt: Tsgt, tmp_path: Path, poses: list[PoseRecord], cause: str
+) -> None:
+    """However many have been valid before."""
+    lines = (encode_line(HelloRecord()), encode_line(MASTER), *map(encode_line, poses), encode_line(MASTER))
+    serving = _serve(tmp_path / "s", *lines)
+    outcome = tsgt("status", "--socket", tmp_path / "s")
+    serving.join()
+    assert outcome.code == 3
+    assert "NO VALID POSE" in outcome.out
+    assert cause in " ".join(outcome.out.split())
+
+
+def test_other_protocol_version_is_refused(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A reader of the old version would misread the stream."""
+    hello = dataclasses.replace(HelloRecord(), protocol=2)
+    serving = _serve(tmp_path / "s", encode_line(hello), encode_line(MASTER), encode_line(LIVE))
+    outcome = tsgt("status", "--socket", tmp_path / "s")
+    serving.join()
+    assert outcome.code == 1
+    assert "protocol version 2" in outcome.err
 
 
 def test_terminal_styles_headlines_and_removes_control_characters(

@@ -16,9 +16,10 @@ from tsgt.cli.live.follower import RETRY_INTERVAL_S, StreamFollower
 from tsgt.cli.live.pose_text import pose_block, worst_sigmas
 from tsgt.cli.live.screen import layout
 from tsgt.cli.live.status_text import WIDTH
-from tsgt.cli.live.watch import MAX_POSE_AGE_S, MAX_SILENCE_S, Watch
+from tsgt.cli.live.watch import Watch
 from tsgt.model import Status
 from tsgt.recording import DiskStatus, StationStatus, encode_line
+from tsgt.web.mission.verdict import POSE_AGE_LIMIT_S, SILENCE_LIMIT_S
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,17 +45,16 @@ def watch_of(status: StatusRecord = SOUND, pose: PoseRecord = LIVE) -> Watch:
     ("status", "pose", "verdict", "cause"),
     [
         (SOUND, LIVE, "GOOD", ""),
-        (SOUND, replace(LIVE, valid=False, reason="outage"), "NO POSE", "outage"),
-        (SOUND, replace(LIVE, degraded_by=("prism_missing",)), "CARE", "prism missing"),
-        (replace(SOUND, protocol="superframe", authenticated=False), LIVE, "CARE", "NO KEY"),
+        (SOUND, replace(LIVE, valid=False, reason="outage"), "NO POSE", "station 1 has not measured prism 1"),
+        (SOUND, replace(LIVE, degraded_by=("prism_missing",)), "CARE", "has not measured prism"),
         (replace(SOUND, disk=DiskStatus(free_bytes=9, total_bytes=99)), LIVE, "CARE", "the disk is full"),
         (
             replace(SOUND, stations=(replace(STATION, status=Status.TILT),)),
             LIVE,
             "CARE",
-            "station 1: NOT LEVEL",
+            "station 1: not level",
         ),
-        (SOUND, replace(LIVE, kind="smoothed"), "NO POSE", "none has been computed"),
+        (SOUND, replace(LIVE, kind="smoothed"), "NO POSE", "no pose yet"),
     ],
 )
 def test_verdict_has_its_cause(status: StatusRecord, pose: PoseRecord, verdict: str, cause: str) -> None:
@@ -67,18 +67,18 @@ def test_verdict_has_its_cause(status: StatusRecord, pose: PoseRecord, verdict: 
 def test_what_is_old_is_not_shown_as_present() -> None:
     """Poses that stop, a stream that stops, and a connection that is lost: no numbers stay on the screen."""
     watch = watch_of()
-    assert watch.verdict(100.0 + MAX_POSE_AGE_S + 0.1, "")[0] == "NO POSE"
-    assert watch.verdict(100.0 + MAX_SILENCE_S + 0.1, "")[0] == "STREAM STOPPED"
+    assert watch.verdict(100.0 + POSE_AGE_LIMIT_S + 0.1, "")[0] == "NO POSE"
+    assert watch.verdict(100.0 + SILENCE_LIMIT_S + 0.1, "")[0] == "STREAM STOPPED"
     assert watch.verdict(100.1, "the stream has ended") == ("NO CONNECTION", "the stream has ended")
     text = "\n".join("\n".join(block) for block in watch.view(100.1, "", width=40)[1])
     assert "x 1.000" in text
     assert "STATION 1" in text
-    old = watch.view(100.0 + MAX_POSE_AGE_S + 0.1, "", width=40)[1]
+    old = watch.view(100.0 + POSE_AGE_LIMIT_S + 0.1, "", width=40)[1]
     assert not any("x 1.000" in line for block in old for line in block)
-    for later, problem in ((100.0 + MAX_SILENCE_S + 0.1, ""), (100.1, "gone")):
+    for later, problem in ((100.0 + SILENCE_LIMIT_S + 0.1, ""), (100.1, "gone")):
         assert watch.view(later, problem, width=40)[1] == []
     watch.take(encode_line(HELLO), 101.0)  # another master
-    assert watch.verdict(101.1, "") == ("NO POSE", "none has been computed yet")
+    assert watch.verdict(101.1, "") == ("NO POSE", "no pose yet: no status yet")
 
 
 @pytest.mark.parametrize(("width", "per_row"), [(40, 1), (79, 1), (80, 2), (200, 4)])

@@ -73,6 +73,7 @@ class Settings:
     prism_constant_m: float = 0.0
     user_constant_m: float = 0.0
     user_prism: str = ""
+    user_reflector: int = 1  # 1 prism, 2 tape
     search_area: tuple[float, float, float, float, int] = (0.0, 0.0, 0.0, 0.0, 0)
     spiral_rad: tuple[float, float] = (0.07, 0.07)  # ATR search window, full width and height
     search_range_m: tuple[int, int] = (0, 400)  # nearest and farthest prism that PowerSearch accepts

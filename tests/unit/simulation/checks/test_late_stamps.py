@@ -45,3 +45,15 @@ def test_only_a_client_that_began_while_the_instrument_was_slow_is_late(
     found = late_stamp_tolerances(result, [_index(*begins_s)], np.array([50.0, 75.0, 100.0]))
     np.testing.assert_allclose(found[:, 0], 3.0 * LATE_S * SPEED_MPS * np.array(late), atol=1e-9)
     np.testing.assert_allclose(found[:, 1], 0.0, atol=1e-9)
+
+
+def test_robot_that_has_slowed_down_was_measured_while_it_was_fast() -> None:
+    """Its poses rest on measurements of the last two seconds."""
+    prism = SimpleNamespace(position_m=(0.1, 0.2, 1.0))
+
+    def stops_at_70_s(at_s: np.ndarray) -> np.ndarray:
+        return _poses(np.minimum(at_s, 70.0))
+
+    result: Any = SimpleNamespace(parameters=SimpleNamespace(prisms=[prism]), true_poses=stops_at_70_s)
+    found = late_stamp_tolerances(result, [_index(5, 65)], np.array([69.0, 71.5, 73.0]))[:, 0]
+    np.testing.assert_allclose(found, 3.0 * LATE_S * SPEED_MPS * np.array([1.0, 1.0, 0.0]), atol=1e-9)

@@ -22,17 +22,28 @@ LATE_S = 0.03
 four. Nothing tells the client (docs/explanation/instrument-time.md).
 """
 
+MEMORY_S = np.arange(0.0, 2.1, 0.5)
+"""Ages of the measurements that poses rest on: the robot may have been faster when it was measured last."""
+
 _HALF_STEP_S = 0.05  # Of the differences that give the robot's speed
 
 
 def late_stamp_tolerances(
     result: MissionResult, indices: Iterable[JournalIndex], at_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """By how much poses at true times, (N,), may be late: in m at the prisms' centroid and in rad, (N, 2)."""
+    """Return what late stamps may add to the errors of poses at true times, (N,): in m at the prisms' centroid and in rad, (N, 2)."""
+    spans = [span for index in indices for span in _late_stamps(index)]
+    ages = [_tolerances(result, spans, np.maximum(at_s - age_s, 0.0)) for age_s in MEMORY_S]
+    return np.asarray(np.max(ages, axis=0))
+
+
+def _tolerances(
+    result: MissionResult, spans: list[tuple[float, float, float]], at_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """By how much a robot that is measured late, in spans as of :func:`_late_stamps`, is displaced at true times, (N,)."""
     late_s = np.zeros(len(at_s))
-    for index in indices:
-        for from_s, to_s, delay_s in _late_stamps(index):
-            late_s[(at_s >= from_s) & (at_s < to_s)] = delay_s
+    for from_s, to_s, delay_s in spans:
+        late_s[(at_s >= from_s) & (at_s < to_s)] = delay_s
     tolerances = np.zeros((len(at_s), 2))
     if late_s.any():
         before, after = result.true_poses(at_s - _HALF_STEP_S), result.true_poses(at_s + _HALF_STEP_S)

@@ -97,9 +97,13 @@ def _get_prism_definition(_station: TotalStationModel, prism_type: int) -> Respo
 
 
 def _set_user_prism(
-    station: TotalStationModel, name: str, constant_m: float, _kind: int, _creator: str
+    station: TotalStationModel, name: str, constant_m: float, reflector: int, _creator: str
 ) -> Response:
-    station.settings.user_prism, station.settings.user_constant_m = name, constant_m
+    """Define the user's prism; whether a real instrument refuses an undefined reflector, 0, is not known."""
+    if reflector not in (1, 2):
+        return INVALID_PARAMETER
+    settings = station.settings
+    settings.user_prism, settings.user_constant_m, settings.user_reflector = name, constant_m, reflector
     return OK
 
 
@@ -211,7 +215,9 @@ SETTING_COMMANDS: Commands = {
     Rpc.BAP_GET_PRISM_TYPE2: Command("", lambda s: values(s.settings.prism_type, s.settings.user_prism)),
     Rpc.BAP_GET_PRISM_DEF: Command("i", _get_prism_definition),
     Rpc.BAP_SET_USER_PRISM_DEF: Command("sdis", _set_user_prism),
-    Rpc.BAP_GET_USER_PRISM_DEF: Command("s", lambda s, _name: values(s.settings.user_constant_m, 0, "tsgt")),
+    Rpc.BAP_GET_USER_PRISM_DEF: Command(
+        "s", lambda s, _name: values(s.settings.user_constant_m, s.settings.user_reflector, "tsgt")
+    ),
     Rpc.BAP_SET_RED_ATR_FOV: Command("i", _set_reduced_field_of_view),
     Rpc.TMC_GET_SLOPE_DIST_CORR: Command("", lambda s: values(s.settings.ppm(), s.settings.prism_constant_m)),
     Rpc.TMC_SET_ATM_CORR: Command("dddd", _set_atmosphere),

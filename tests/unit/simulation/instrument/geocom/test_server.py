@@ -64,6 +64,13 @@ async def test_malformed_request_gives_a_transport_code(line: bytes, com_code: i
     assert (await Bench().type(line)).com_code == com_code
 
 
+@pytest.mark.parametrize(("reflector", "code"), [(0, 2), (1, 0), (2, 0), (3, 2)])
+async def test_user_defined_prism_needs_a_reflector(reflector: int, code: int) -> None:
+    """BAP_REFLTYPE: a prism or a tape; 0 is undefined."""
+    bench = Bench()
+    assert (await bench.type(b'%%R1Q,17032,1:"own",0.01,%d,"us"\r\n' % reflector)).code == code
+
+
 async def test_checksums() -> None:
     """A request with a checksum gets a response with one."""
     bench = Bench()

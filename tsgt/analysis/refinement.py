@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tsgt.errors import GeometryError
 from tsgt.estimation import parameter_names
 from tsgt.geometry.motion_calibration import Setup, SetupParameters, calibrated_covariance, refine_setup
+from tsgt.geometry.motion_calibration.refinement import MIN_LOG_BAYES_FACTOR_OF_USE
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 Refine = Literal["auto", "off", "prisms"]
 """What may be refined where the data disagree with the set-up: frames, latencies and instrument errors (``auto``), nothing,
 or the prisms as well."""
+
+_DOUBTFUL_P_VALUE, _DOUBTFUL_LOG_BAYES_FACTOR = 0.01, 5.0  # Beyond one of them a set-up is not called right
 
 
 def refine_recorded_setup(
@@ -74,6 +77,14 @@ def refinement_text(refined: RefinedSetup | None, parameters: Parameters) -> str
     """Return in words what was refined."""
     if refined is None:
         return "Set-up: as recorded, not compared with the measurements"
+    if not refined.used and (
+        refined.p_value < _DOUBTFUL_P_VALUE or refined.log_bayes_factor > _DOUBTFUL_LOG_BAYES_FACTOR
+    ):
+        return (
+            "Set-up: as recorded; not refined: the evidence against it is below the limit of its use, log Bayes factor "
+            f"{refined.log_bayes_factor:.1f} of {MIN_LOG_BAYES_FACTOR_OF_USE:.0f} (p-value {refined.p_value:.2g}); tsgt evaluate "
+            "--report lists what may be wrong"
+        )
     if not refined.used:
         return "Set-up: as recorded; the measurements do not contradict it"
     selected = [

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
+import pytest
 
-from tsgt.analysis.refinement import refinement_rows
+from tsgt.analysis.refinement import refinement_rows, refinement_text
 from tsgt.config import ScenarioConfig, scenario_parameters
 from tsgt.geometry.motion_calibration import Hypothesis, HypothesisEvidence, RefinedSetup
 
@@ -43,3 +44,21 @@ def test_rows_state_what_may_be_wrong() -> None:
 def test_nothing_compared_gives_no_rows() -> None:
     """The refinement is switched off."""
     assert refinement_rows(None, scenario_parameters(ScenarioConfig())) == ()
+
+
+@pytest.mark.parametrize(
+    ("log_bayes_factor", "p_value", "said"),
+    [
+        (-3.0, 0.4, "the measurements do not contradict it"),
+        (19.67, 0.0066, "below the limit of its use, log Bayes factor 19.7 of 20 (p-value 0.0066)"),
+        (12.0, 0.3, "below the limit of its use, log Bayes factor 12.0 of 20 (p-value 0.3)"),
+        (2.0, 0.002, "below the limit of its use, log Bayes factor 2.0 of 20 (p-value 0.002)"),
+    ],
+)
+def test_set_up_that_is_not_refined_is_not_called_right(
+    log_bayes_factor: float, p_value: float, said: str
+) -> None:
+    """Measurements may contradict it by less than a refinement needs."""
+    found = SimpleNamespace(evidence=(), used=False, log_bayes_factor=log_bayes_factor, p_value=p_value)
+    text = refinement_text(cast("RefinedSetup", found), scenario_parameters(ScenarioConfig()))
+    assert said in text

@@ -15,6 +15,7 @@ from tsgt.geometry import check_layout, corrected_distance, measurement_covarian
 from tsgt.geometry.target_calibration import (
     CONSISTENCY,
     ERRORS,
+    CauseKind,
     InstrumentError,
     PointSet,
     TargetReadings,
@@ -74,18 +75,35 @@ class TargetCalibration:
         return {error: self.network.errors[row, error] for error in ERRORS}
 
     def instrument_errors(self) -> dict[int, InstrumentErrors]:
-        """Errors that also hold for prisms, by station; the range constant is that of the targets."""
+        """Errors that also hold for prisms, by station; the range constant is that of the targets.
+
+        A scale only where the targets show one: it replaces ``atmospheric_ppm`` of the configuration, and a scale that all
+        stations have in common deforms nothing.
+        """
         if not self.applied:
             return {}
         result = {}
+        scaled = self._scaled_stations()
         for station in self.network.readings.stations:
             errors = self.errors(station)
             result[station] = InstrumentErrors(
                 vertical_index_rad=errors[InstrumentError.VERTICAL_INDEX].value,
                 collimation_rad=errors[InstrumentError.COLLIMATION].value,
-                range_scale_ppm=1e6 * errors[InstrumentError.RANGE_SCALE].value,
+                range_scale_ppm=1e6 * errors[InstrumentError.RANGE_SCALE].value
+                if station in scaled
+                else None,
             )
         return result
+
+    def _scaled_stations(self) -> set[int]:
+        """Stations for which a scale of the distances is a cause, or is not told apart from one."""
+        return {
+            self.network.readings.stations[each.station]
+            for cause in self.network.causes
+            if cause.kind is CauseKind.INSTRUMENT
+            for each in (cause, *cause.alternatives)
+            if each.error is InstrumentError.RANGE_SCALE
+        }
 
 
 def solve_stations(

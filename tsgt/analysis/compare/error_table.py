@@ -37,7 +37,7 @@ _BLOCK = 10_000
 
 
 def error_csv(comparisons: Iterable[Comparison]) -> Iterator[str]:
-    """Yield the header and the lines; cells without a value are empty."""
+    """Yield the header and the lines, from which the same doubles are read; cells without a value are empty."""
     yield ",".join(COLUMNS) + "\n"
     for each in comparisons:
         series = each.errors.series
@@ -61,7 +61,7 @@ def error_csv(comparisons: Iterable[Comparison]) -> Iterator[str]:
 
 def _lines(name: str, stamps: Sequence[int], numbers: FloatArray) -> Iterator[str]:
     for stamp, row in zip(stamps, numbers.tolist(), strict=True):
-        cells = ("" if math.isnan(value) else f"{value:.7g}" for value in row)
+        cells = ("" if math.isnan(value) else repr(value) for value in row)
         yield f"{name},{stamp},{','.join(cells)}\n"
 
 

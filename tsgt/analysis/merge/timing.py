@@ -147,8 +147,8 @@ def link_delay(delivered: Sequence[DeliveredTime]) -> tuple[int, int] | None:
     delay_ns = round(median(delays_ns))
     # Each difference is correct within the sum of the two bounds; the tightest counts.
     bound_ns = min(
-        each.recorded_bound_ns + each.computed.bound_ns + abs(delay_ns - delay_ns)
-        for each, delay_ns in zip(delivered, delays_ns, strict=True)
+        each.recorded_bound_ns + each.computed.bound_ns + abs(each_ns - delay_ns)
+        for each, each_ns in zip(delivered, delays_ns, strict=True)
     )
     return delay_ns, bound_ns
 

@@ -101,6 +101,10 @@ def motion(
         refuse_overwrite([recording], path)
     if prism_output is not None and not estimate_prisms:
         raise click.UsageError("--prism-output needs --estimate-prisms; without it the layout is fixed")
+    if output is not None and prism_output is not None and output.resolve() == prism_output.resolve():
+        raise click.UsageError(
+            "--output and --prism-output are the same file; the prisms would replace the frames"
+        )
     known = frames == "known"
     loaded = load_recording(recording, keep_going=keep_going, on_problem=report_problem)
     loaded = calibrated(loaded, recording)

@@ -128,6 +128,7 @@ def targets(
     options += given("--max-residual-mm", max_residual_mm)
     if output is not None and solved.consistent:
         _write(output, solved, comment=f"written by tsgt calibrate targets {file}{options}")
+        notes += _scale_notes(output, solved)
     failures = _failures(solved, command, excluded, output)
     written = _written(solved, output)
     if as_json:
@@ -154,6 +155,15 @@ def _write(output: Path, solved: TargetCalibration, *, comment: str) -> None:
         instrument_errors=solved.instrument_errors(),
         covariance=solved.covariance,
     )
+
+
+def _scale_notes(output: Path, solved: TargetCalibration) -> list[str]:
+    return [
+        f"{output} has the scale of station {station}'s distances, {errors.range_scale_ppm:.3g} ppm; it replaces "
+        "atmospheric_ppm of the configuration"
+        for station, errors in solved.instrument_errors().items()
+        if errors.range_scale_ppm is not None
+    ]
 
 
 def _written(solved: TargetCalibration, output: Path | None) -> str:

@@ -12,6 +12,7 @@ import click
 
 from tsgt.analysis.formats import measurement_csv, messages, pose_csv, tum_lines, valid_records, write_mcap
 from tsgt.analysis.processing import process
+from tsgt.cli.desk.unused_options import refuse_unused_by_linear, refuse_unused_wheels
 from tsgt.cli.options import (
     keep_going_option,
     path_type,
@@ -23,16 +24,15 @@ from tsgt.cli.options import (
 )
 from tsgt.cli.output import refuse_overwrite, report_problem, require_extra
 from tsgt.cli.progress import TUNING, progress
-from tsgt.cli.recordings import imu_options, load, load_reference, write_lines
+from tsgt.cli.recordings import ImuOptions, imu_options, load, load_reference, write_lines
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import records_at
 from tsgt.model import ROBOT_ORIGIN, Parameters, ReferencePoint
-from tsgt.recording import PoseRecord, decode_line, read_lines, write_atomically
+from tsgt.recording import PoseRecord, decode_line, load_recording, read_lines, write_atomically
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Generator, Iterable, Iterator
 
-    from tsgt.cli.recordings import ImuOptions
     from tsgt.recording import Kind, Recording
 
 STDOUT = Path("-")
@@ -117,8 +117,17 @@ def export(
         raise click.UsageError(
             "TUM contains poses only, MCAP poses and prism positions; export raw measurements with --format csv"
         )
+    if records == "measurements" and (
+        series is not None or point is not None or reference_point is not None or imu != ImuOptions()
+    ):
+        raise click.UsageError(
+            "raw measurements are exported as recorded: --kind, --delay-s, --point, --reference-point and options of the IMU "
+            "choose poses"
+        )
     if reference_path is not None and format_name != "mcap":
         raise click.UsageError("--reference needs --format mcap; `tsgt evaluate --reference` compares")
+    if reference_point is not None and reference_path is None:
+        raise click.UsageError("--reference-point needs --reference")
     if format_name == "mcap":
         if output == STDOUT:
             raise click.UsageError("MCAP is binary and is not written to stdout; give --output FILE")
@@ -135,7 +144,9 @@ def export(
         return
     lines: Iterable[str]
     if records == "measurements":
-        lines = measurement_csv(load(recording, keep_going=keep_going).measurements)
+        # Those before another set-up, and without any, are as recorded, too.
+        raw = load_recording(recording, whole=True, keep_going=keep_going, on_problem=report_problem)
+        lines = measurement_csv(raw.measurements)
     else:
         poses = _poses_of(recording, series, point, imu, keep_going=keep_going, quiet=output == STDOUT)
         lines = pose_csv(poses) if format_name == "csv" else tum_lines(valid_records(poses), point)
@@ -170,19 +181,42 @@ def _poses_of(
     quiet: bool = False,
     loaded: Recording | None = None,
 ) -> Iterator[PoseRecord]:
-    """Yield the poses of a recording, carried over to a point; if it has none, compute them.
+    """Return the poses of a recording, carried over to a point; if it has none, compute them.
 
     ``quiet`` suppresses the progress bar, which would mix with lines on the terminal. Problems of a recording that is
-    ``loaded`` have been reported already.
+    ``loaded`` have been reported already. Raises UsageError for options of the IMU if there are poses.
     """
-    found = False
     recorded = _recorded_poses(path, series, keep_going=keep_going, quiet=quiet, reported=loaded is not None)
+    first = next(recorded, None)
+    if first is None:
+        return _computed(path, series, point, imu, keep_going=keep_going, loaded=loaded)
+    if imu != ImuOptions():
+        recorded.close()
+        raise click.UsageError(
+            f"{path} holds poses, which are exported as they are: options of the IMU have no effect; `tsgt process` computes "
+            "poses with them"
+        )
+    return _carried_over(itertools.chain([first], recorded), point)
+
+
+def _carried_over(
+    recorded: Iterable[tuple[ReferencePoint, PoseRecord]], point: ReferencePoint
+) -> Iterator[PoseRecord]:
     for own_point, poses in itertools.groupby(recorded, key=lambda pair: pair[0]):
-        found = True
         of_point = (pose for _, pose in poses)
         yield from of_point if own_point == point else records_at(of_point, own_point, point)
-    if found:
-        return
+
+
+def _computed(
+    path: Path,
+    series: str | None,
+    point: ReferencePoint,
+    imu: ImuOptions,
+    *,
+    keep_going: bool,
+    loaded: Recording | None,
+) -> Iterator[PoseRecord]:
+    """Yield computed poses of a recording that has none of the series."""
     if series is not None:
         kind, _, delay = series.partition("_")
         which, option = (f"{kind} poses at {delay}", "--delay-s") if delay else (f"{kind} poses", "--kind")
@@ -190,13 +224,15 @@ def _poses_of(
     click.echo(f"{path} holds no poses; processing its measurements", err=True)
     with progress("fitting", first=TUNING) as on_progress:
         loaded = loaded or load(path, keep_going=keep_going, point=point, imu=imu)
+        refuse_unused_by_linear(loaded, path, imu)
+        refuse_unused_wheels(loaded, path, imu)
         batch = process(loaded, path=path, on_progress=on_progress)
     yield from batch.records()
 
 
 def _recorded_poses(
     path: Path, series: str | None, *, keep_going: bool, quiet: bool, reported: bool
-) -> Iterator[tuple[ReferencePoint, PoseRecord]]:
+) -> Generator[tuple[ReferencePoint, PoseRecord], None, None]:
     """Yield the poses of a series (default: interpolated and final ones), each with its point."""
     point = ROBOT_ORIGIN
     on_problem = None if reported else report_problem

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tsgt.cli.convert.cut_tables import note_cut_tables
 from tsgt.cli.convert.imported_samples import write_samples
 from tsgt.cli.options import RECORDING_SUFFIXES, FiniteRange, OutputFile, json_option, path_type
 from tsgt.cli.output import print_json, refuse_overwrite
@@ -41,9 +42,11 @@ def import_imu(
     included. Times must be those of the device, not of the arrival: durations are their differences.
     """
     from tsgt.analysis.formats import imu_records, interval_ns, read_imu_files
+    from tsgt.analysis.formats.imu_files import TABLE_SUFFIX
 
     refuse_overwrite(files, output)
     samples = read_imu_files(files, topic)
+    note_cut_tables(path for path in files if path.suffix == TABLE_SUFFIX)
     gaps = write_samples(output, "imu", files, imu_records(samples, round(offset_ms * 1e6)))
     rate_hz = 1e9 / interval_ns(samples)
     if as_json:

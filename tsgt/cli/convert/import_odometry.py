@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tsgt.cli.convert.cut_tables import note_cut_tables
 from tsgt.cli.convert.imported_samples import write_samples
 from tsgt.cli.options import RECORDING_SUFFIXES, FiniteRange, OutputFile, json_option, path_type
 from tsgt.cli.output import print_json, refuse_overwrite
@@ -40,6 +41,7 @@ def import_odometry(*, files: tuple[Path, ...], offset_ms: float, output: Path, 
 
     refuse_overwrite(files, output)
     samples = read_wheel_files(files)
+    note_cut_tables(files)
     gaps = write_samples(output, "odometry", files, wheel_records(samples, round(offset_ms * 1e6)))
     duration_s = (samples[-1].stamp_ns - samples[0].stamp_ns) / 1e9
     if as_json:

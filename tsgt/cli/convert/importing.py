@@ -23,6 +23,7 @@ from tsgt.analysis.rts_import import (
     stations_from_targets,
 )
 from tsgt.analysis.setup_replacement import with_calibration, with_layout
+from tsgt.cli.convert.cut_tables import note_cut_tables
 from tsgt.cli.convert.import_imu import import_imu
 from tsgt.cli.convert.import_odometry import import_odometry
 from tsgt.cli.options import (
@@ -169,6 +170,7 @@ def import_polar(
     sources = [*tracks, prisms, *(path for path in (frames, targets) if path is not None)]
     refuse_overwrite(sources, output)
     measurements = read_polar_tracks(tracks)
+    note_cut_tables(tracks)
     check_tracks(measurements, tracks)
     tracked = tracked_prisms(measurements)
     layout = read_prisms(prisms, sorted({m.prism for m in measurements}))

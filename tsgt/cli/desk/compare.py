@@ -199,12 +199,15 @@ def _settings(
 
 def _with_names(found: Sequence[Estimate]) -> list[Estimate]:
     """Return the estimates with a name of its own each."""
-    taken: dict[str, int] = {}
+    taken: set[str] = set()
     named = []
     for each in found:
-        taken[each.name] = taken.get(each.name, 0) + 1
-        number = taken[each.name]
-        named.append(each if number == 1 else dataclasses.replace(each, name=f"{each.name} {number}"))
+        name, number = each.name, 1
+        while name in taken:
+            number += 1
+            name = f"{each.name} {number}"
+        taken.add(name)
+        named.append(dataclasses.replace(each, name=name))
     return named
 
 

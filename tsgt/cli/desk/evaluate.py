@@ -25,6 +25,7 @@ from tsgt.analysis.smoothing import smooth_recording
 from tsgt.cli.desk.live_poses import print_live
 from tsgt.cli.desk.reference import compare_estimators, print_comparisons
 from tsgt.cli.desk.report import assess, print_verdicts, refuse_report, report_evaluation
+from tsgt.cli.desk.unused_options import refuse_unused_wheels
 from tsgt.cli.options import (
     json_option,
     keep_going_option,
@@ -163,6 +164,7 @@ def evaluate(
         point=point,
         imu=imu,
     )
+    refuse_unused_wheels(loaded, recording, imu)
     reference = load_reference(reference_path, reference_point, loaded.parameters)
     if report_folder is not None:
         report_evaluation(

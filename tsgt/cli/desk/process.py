@@ -13,6 +13,7 @@ from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.processing import process as process_recording
 from tsgt.analysis.refinement import refinement_keys, refinement_text
 from tsgt.analysis.smoothing import smooth_poses
+from tsgt.cli.desk.unused_options import refuse_unused_by_linear, refuse_unused_wheels
 from tsgt.cli.options import (
     FiniteRange,
     json_option,
@@ -118,6 +119,8 @@ def process(
         point=point,
         imu=imu,
     )
+    refuse_unused_by_linear(loaded, recording, imu, refine)
+    refuse_unused_wheels(loaded, recording, imu)
     poses, parameters, continuous = _processed(loaded, recording, refine)
     with progress("writing poses") as on_progress:
         if format_name == "tum":

@@ -14,6 +14,7 @@ from harness.instruments.target_field import TargetField
 
 from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_calibration
 from tsgt.geometry.target_calibration import InstrumentError
+from tsgt.model import StationParameters
 
 if TYPE_CHECKING:
     from harness.files.cli import Tsgt
@@ -260,6 +261,36 @@ def test_instrument_error_is_written(tsgt: Tsgt, tmp_path: Path) -> None:
     assert written.stations[2].vertical_index_rad == pytest.approx(3e-4, abs=2e-5)
     assert written.covariance is not None
     assert "station1.vertical_index" in written.covariance.components
+
+
+def test_common_scale_leaves_the_configured_one_in_force(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Targets do not show a scale of all stations, of distances without atmospheric correction: the file has none."""
+    field = TargetField(
+        rng=np.random.default_rng(1), errors={(row, InstrumentError.RANGE_SCALE): 6e-5 for row in range(3)}
+    )
+    output = tmp_path / "frames.toml"
+    done = tsgt("calibrate", "targets", written_to(field, tmp_path), *TARGET_CONSTANT, "--output", output)
+    assert done.code == 0
+    assert "replaces" not in done.err
+    stations = load_station_calibration(output).stations
+    assert [stations[station].range_scale_ppm for station in (1, 2, 3)] == [None, None, None]
+    configured = StationParameters(station=2, prism=2, atmospheric_ppm=60.0)
+    assert stations[2].applied(configured).atmospheric_ppm == 60.0
+
+
+def test_scale_that_is_a_cause_is_written_with_a_note(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A scale of one station is written for this station only; the note says what it replaces."""
+    field = TargetField(rng=np.random.default_rng(2), errors={(1, InstrumentError.RANGE_SCALE): 1e-4}, far=3)
+    output = tmp_path / "frames.toml"
+    done = tsgt(
+        "calibrate", "targets", written_to(field, tmp_path), *TARGET_CONSTANT, "--output", output, "--json"
+    )
+    assert done.code == 0
+    stations = load_station_calibration(output).stations
+    assert stations[2].range_scale_ppm == pytest.approx(100, abs=15)
+    assert [stations[station].range_scale_ppm for station in (1, 3)] == [None, None]
+    assert f"{output} has the scale of station 2's distances, " in done.err
+    assert "ppm; it replaces atmospheric_ppm of the configuration" in done.json()["notes"][-1]
 
 
 def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -183,6 +183,16 @@ def test_prism_output_needs_estimate_prisms(tsgt: Tsgt, recording: Path, tmp_pat
     assert tsgt("calibrate", "motion", recording, "--prism-output", tmp_path / "prisms.toml").code == 2
 
 
+def test_frames_and_prisms_need_a_file_each(tsgt: Tsgt, recording: Path, tmp_path: Path) -> None:
+    """The second would replace the first."""
+    (tmp_path / "sub").mkdir()
+    outputs = ("--output", tmp_path / "a.toml", "--prism-output", tmp_path / "sub" / ".." / "a.toml")
+    done = tsgt("calibrate", "motion", recording, "--estimate-prisms", *outputs)
+    assert done.code == 2
+    assert "--output and --prism-output are the same file" in done.err
+    assert not (tmp_path / "a.toml").exists()
+
+
 @pytest.mark.slow
 def test_published_drive_has_smaller_held_out_errors(tsgt: Tsgt, field_data: Path, tmp_path: Path) -> None:
     """The held-out error is at most 0.45 times that of linear interpolation, 0.35 times in gaps."""

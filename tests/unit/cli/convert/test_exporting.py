@@ -163,6 +163,11 @@ def test_invalid_poses_have_no_message(tsgt: Tsgt, tmp_path: Path) -> None:
         (["--format", "mcap"], "--output FILE"),
         (["--format", "mcap", "--records", "measurements", "--output", "x"], "--format csv"),
         (["--format", "tum", "--reference", "x"], "tsgt evaluate"),
+        (["--format", "mcap", "--output", "x", "--reference-point", "1,1,1"], "needs --reference"),
+        (["--format", "csv", "--records", "measurements", "--kind", "predicted"], "choose poses"),
+        (["--format", "csv", "--records", "measurements", "--delay-s", "1"], "choose poses"),
+        (["--format", "csv", "--records", "measurements", "--point", "1,2,3"], "choose poses"),
+        (["--format", "csv", "--records", "measurements", "--no-imu"], "choose poses"),
     ],
 )
 def test_inconsistent_options_are_rejected(tsgt: Tsgt, live: Path, arguments: list[str], says: str) -> None:
@@ -170,6 +175,36 @@ def test_inconsistent_options_are_rejected(tsgt: Tsgt, live: Path, arguments: li
     outcome = tsgt("export", live, *arguments)
     assert outcome.code == 2
     assert says in outcome.err
+
+
+@pytest.mark.parametrize(
+    "option", [("--no-imu",), ("--imu", "x"), ("--imu-setup", "x"), ("--wheel-odometry", "x")]
+)
+def test_recorded_poses_are_not_those_of_another_imu(
+    tsgt: Tsgt, live: Path, tmp_path: Path, option: tuple[str, ...]
+) -> None:
+    """Recorded poses would pass for poses with or without an IMU: nothing is written, also not to stdout."""
+    for output in ((), ("--output", tmp_path / "out.tum")):
+        outcome = tsgt("export", live, "--format", "tum", *option, *output)
+        assert (outcome.code, outcome.out) == (2, "")
+        assert "holds poses, which are exported as they are: options of the IMU have no effect" in outcome.err
+    assert list(tmp_path.iterdir()) == [live]
+
+
+def test_measurements_are_exported_as_recorded(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Those before the set-up was replaced, and those of a master without calibration."""
+    path = tmp_path / "raw.jsonl"
+    for records in (
+        (HEADER, PARAMETERS, measurement(0), PARAMETERS, measurement(1)),
+        (HEADER, dataclasses.replace(PARAMETERS, no_poses="not calibrated"), measurement(0), measurement(1)),
+    ):
+        path.write_bytes(b"".join(encode_line(record) + b"\n" for record in records))
+        outcome = tsgt("export", path, "--format", "csv", "--records", "measurements")
+        assert (outcome.code, outcome.err) == (0, "")
+        assert [row["sequence"] for row in csv.DictReader(outcome.out.splitlines())] == [
+            str(measurement(0).sequence),
+            str(measurement(1).sequence),
+        ]
 
 
 def test_inputs_are_not_overwritten(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:

@@ -90,6 +90,18 @@ def test_table_is_imported(tmp_path: Path) -> None:
     assert first.instrument_time_ns[0] == START_NS
 
 
+@pytest.mark.parametrize("cut", [0, 1, 3])
+def test_cut_table_is_imported_with_a_note(tmp_path: Path, cut: int) -> None:
+    """A number may have lost its last digits where the last line has no end."""
+    table = write_table(tmp_path / "imu.csv")
+    table.write_bytes(table.read_bytes()[: -cut or None])
+    done = called("import", "imu", table, "--output", tmp_path / "imu.jsonl")
+    assert done.code == 0
+    assert ("note" in done.err) == (cut > 0)
+    if cut:
+        assert f"note: {table}: the last line has no line end" in done.err
+
+
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 def test_bag_is_imported(tmp_path: Path, plugin: StoragePlugin) -> None:
     """By the stamps in the messages, not by those of the bag."""

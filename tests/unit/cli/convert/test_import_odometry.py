@@ -38,6 +38,15 @@ def test_table_becomes_lines_of_odometry(tmp_path: Path) -> None:
     assert last.sequence + len(last.stamp_ns) == 50
 
 
+def test_cut_table_is_imported_with_a_note(tmp_path: Path) -> None:
+    """A last line without line end may lack digits."""
+    table = write_table(tmp_path / "wheels.csv")
+    table.write_bytes(table.read_bytes()[:-1])
+    done = called("import", "odometry", table, "--output", tmp_path / "odometry.jsonl")
+    assert done.code == 0
+    assert f"note: {table}: the last line has no line end" in done.err
+
+
 def test_table_without_speed_is_rejected(tmp_path: Path) -> None:
     """The error names the column."""
     table = write_table(tmp_path / "wheels.csv", "stamp_ns,velocity,yaw_rate_radps")

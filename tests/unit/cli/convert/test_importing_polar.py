@@ -114,3 +114,19 @@ def test_invalid_line_is_named(tsgt: Tsgt, recording: Path) -> None:
     assert outcome.code == 1
     assert outcome.err.splitlines()[-1].startswith(f"error: {tracks}, line 4: status is 'good'")
     assert not out.exists()
+
+
+def test_cut_track_is_imported_with_a_note(tsgt: Tsgt, recording: Path) -> None:
+    """A last line without line end may lack digits."""
+    tracks = exported(tsgt, recording)
+    tracks.write_bytes(tracks.read_bytes()[:-1])
+    out = recording.with_name("cut.jsonl")
+    sources = (
+        "--prisms",
+        recording.with_name("sensor_positions.csv"),
+        "--targets",
+        recording.with_name("GCP.txt"),
+    )
+    done = tsgt("import", "polar", "--tracks", tracks, *sources, *CONSTANTS, "--output", out)
+    assert done.code == 0, done.err
+    assert f"note: {tracks}: the last line has no line end" in done.err

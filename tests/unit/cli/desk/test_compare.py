@@ -152,6 +152,20 @@ def test_errors_are_written_as_csv(reference: Path, fitted: dict[str, Any]) -> N
     squares = [float(row["position_error_m"]) ** 2 for row in rows if row["estimate"] == "lidar"]
     assert 1e3 * np.sqrt(np.mean(squares)) == pytest.approx(ate["position_rms_mm"], rel=1e-4)
     assert rows[0]["reference_sigma_along_m"] == ""
+    # To the last bit: seven digits are millimetres beyond a kilometre.
+    assert max(len(row["path_m"].replace(".", "").strip("0")) for row in rows) > 12
+
+
+def test_each_estimate_has_a_name_of_its_own(tsgt: Tsgt, reference: Path, tmp_path: Path) -> None:
+    """Also if a file has the name that another one of the same name got."""
+    paths = [
+        tmp_path / name / file for name, file in (("a", "est"), ("b", "est"), ("c", "est 2"), ("d", "est"))
+    ]
+    for path in paths:
+        path.parent.mkdir()
+        write_tum(path.with_suffix(".tum"), TRUE)
+    outcome = tsgt("compare", reference, *(path.with_suffix(".tum") for path in paths), "--json")
+    assert list(outcome.json()["estimates"]) == ["est", "est 2", "est 2 2", "est 3"]
 
 
 @pytest.mark.slow

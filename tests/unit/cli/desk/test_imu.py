@@ -74,6 +74,39 @@ def test_two_stations_need_the_imu(
     assert message in done.err
 
 
+@pytest.mark.parametrize("command", ["process", "evaluate", "export"])
+def test_wheels_without_an_imu_are_refused(tsgt: Tsgt, folder: Path, tmp_path: Path, command: str) -> None:
+    """They are used with an IMU only, and the same poses would pass for poses with wheels."""
+    wheels, output = tmp_path / "wheels.jsonl", tmp_path / "a.tum"
+    wheels.write_bytes(
+        encode_line(HEADER) + b"\n" + encode_line(driven(shaken_drive(22.0), 1.0, scale=1.0)) + b"\n"
+    )
+    arguments = () if command == "evaluate" else ("--output", output)
+    done = tsgt(command, folder / "without.jsonl", "--wheel-odometry", wheels, *arguments)
+    assert done.code == 2
+    assert "wheel odometry is used with one only" in done.err
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--refine", "prisms"), "--refine prisms"),
+        (("--imu", "samples.jsonl", "--imu-setup", "imu.toml"), "--imu and --imu-setup"),
+    ],
+)
+def test_linear_refuses_what_it_does_not_use(
+    tsgt: Tsgt, folder: Path, tmp_path: Path, options: tuple[str, ...], named: str
+) -> None:
+    """Its poses would pass for poses with an IMU, or with refined prisms."""
+    given = [folder / option if "." in option else option for option in options]
+    output = tmp_path / "a.tum"
+    done = tsgt("process", folder / "with.jsonl", "--estimator", "linear", *given, "--output", output)
+    assert done.code == 2
+    assert f"does not use {named}; the estimator continuous does" in done.err
+    assert not output.exists()
+
+
 @pytest.mark.slow
 def test_export_gives_poses_of_the_imu_by_its_name(tsgt: Tsgt, folder: Path, tmp_path: Path) -> None:
     """The points of the robot have names."""

@@ -23,8 +23,11 @@ _SECONDS = re.compile(r"(?:.*[./_])?(?:s|sec|secs|seconds)")
 _NANOSECONDS = re.compile(r"(?:.*[./_])?(?:nsec|nsecs|nanosec|nanosecs|nanoseconds)")
 _POSITION = re.compile(r"(?:.*[./])?(?:(?:position|translation|point|pos|trans|p|t)[._]?)?([xyz])(?:_m)?")
 _EUROC_POSITION = re.compile(r"p_[a-z0-9]+_[a-z0-9]+_([xyz])")
-_ORIENTATION = re.compile(r"(?:.*[./])?(?:orientation|quaternion|rotation|quat|rot|q)[._]?([xyzw])")
+_ORIENTATION = re.compile(r"(?:.*[./])?(?:orientation|quaternion|rotation|quat|rot|q)[._/]?([xyzw])")
 _EUROC_ORIENTATION = re.compile(r"q_[a-z0-9]+(?:_[a-z0-9]+)?_([wxyz])")
+_LIKE_ORIENTATION = re.compile(
+    r"(?!.*(?:cov|sigma|std))(?:.*[./_])?(?:orientation|quaternion|rotation|quat|rot|q)[._/]?(?:[xyzw]|[0-4])"
+)
 _NOT_POSITION = re.compile(
     r".*(?:orientation|quaternion|rotation|linear|angular|velocity|acceleration|twist|cov|sigma|std).*"
 )
@@ -66,7 +69,7 @@ def pose_columns(table: NumberTable, text_format: TextFormat | None) -> PoseColu
     """
     count = len(table.columns)
     if text_format in (None, "csv") and table.names is not None:
-        found = by_name(table.names)
+        found = by_name(table)
         if found is not None:
             return found
         if text_format == "csv" or table.header_line is not None:
@@ -96,13 +99,18 @@ def pose_columns(table: NumberTable, text_format: TextFormat | None) -> PoseColu
     )
 
 
-def by_name(names: Sequence[str]) -> PoseColumns | None:
-    """Find the columns by their names; None unless a time and a whole position are named, each once."""
-    plain = [_plain(name) for name in names]
+def by_name(table: NumberTable) -> PoseColumns | None:
+    """Find the columns by their names; None unless a time and a whole position are named, each once.
+
+    Raises InputFileError for the names of an orientation in part: without it the same estimate has other errors.
+    """
+    plain = [_plain(name) for name in table.names or ()]
     positions, quaternion = _axes(plain, "xyz", position=True), _axes(plain, "xyzw", position=False)
     time = _time(plain)
     if time is None or positions is None:
         return None
+    if quaternion is None:
+        _check_no_orientation(table, plain)
     x, y, z = positions
     sigmas = ("sigma_x_m", "sigma_y_m", "sigma_z_m", "sigma_rx_rad", "sigma_ry_rad", "sigma_rz_rad")
     stated = [name for name, _ in plain]
@@ -113,6 +121,23 @@ def by_name(names: Sequence[str]) -> PoseColumns | None:
         valid=stated.index("valid") if "valid" in stated else None,
         sigma=tuple(stated.index(name) for name in sigmas) if set(sigmas) <= set(stated) else (),
     )
+
+
+def _check_no_orientation(table: NumberTable, plain: Sequence[tuple[str, str]]) -> None:
+    alike = [
+        name
+        for name, (stated, unit) in zip(table.names or (), plain, strict=True)
+        if _EUROC_ORIENTATION.fullmatch(stated)
+        or _LIKE_ORIENTATION.fullmatch(stated)
+        or _LIKE_ORIENTATION.fullmatch(stated + unit)
+    ]
+    if alike:
+        raise InputFileError(
+            f"the columns {quoted(', '.join(alike))} are no whole orientation; name one quaternion qx, qy, qz, qw, each once, "
+            "or rename them for positions alone",
+            path=table.path,
+            line=table.header_line,
+        )
 
 
 def _plain(name: str) -> tuple[str, str]:
@@ -127,15 +152,14 @@ def _time(plain: Sequence[tuple[str, str]]) -> tuple[int, TimeUnit | None, int |
 
     Of several the first, but rather a message's own stamp than the time at which it was recorded.
     """
-    found = [(index, _TIME.fullmatch(name), name, unit) for index, (name, unit) in enumerate(plain)]
-    fitting = [each for each in found if each[1] is not None]
-    if fitting:
-        index, match, _, unit = next((each for each in fitting if "header" in each[2]), fitting[0])
-        return index, _UNITS.get((match and match[1]) or unit), None
+    found: list[tuple[str, tuple[int, TimeUnit | None, int | None]]] = []
+    for index, (name, unit) in enumerate(plain):
+        if match := _TIME.fullmatch(name):
+            found.append((name, (index, _UNITS.get(match[1] or unit), None)))
     for index, (name, _) in enumerate(plain[:-1]):
         if _SECONDS.fullmatch(name) and _NANOSECONDS.fullmatch(plain[index + 1][0]):
-            return index, "s", index + 1
-    return None
+            found.append((name, (index, "s", index + 1)))
+    return next((time for name, time in found if "header" in name), found[0][1] if found else None)
 
 
 def _axes(plain: Sequence[tuple[str, str]], axes: str, *, position: bool) -> list[int] | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.analysis.formats.number_table import joined_times_ns, read_number_table, times_ns
-from tsgt.analysis.formats.trajectories.columns import KITTI_COLUMNS, pose_columns
+from tsgt.analysis.formats.trajectories.columns import KITTI_COLUMNS, by_name, pose_columns
 from tsgt.analysis.formats.trajectories.raw import RawTrajectory
 from tsgt.errors import InputFileError
 from tsgt.geometry import quaternion_from_rotation
@@ -34,7 +34,10 @@ def read_text(
     ``times``: of a KITTI file; default: ``times.txt`` or ``NAME_times.txt`` beside it. Raises InputFileError.
     """
     table = read_number_table(path)
-    if text_format == "kitti" or (text_format is None and len(table.columns) == KITTI_COLUMNS):
+    if text_format == "kitti" or (
+        # Names decide: another program's pose may have as many columns.
+        text_format is None and len(table.columns) == KITTI_COLUMNS and by_name(table) is None
+    ):
         return _kitti(table, times)
     return _table(table, text_format)
 

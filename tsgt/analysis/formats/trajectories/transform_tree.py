@@ -26,11 +26,15 @@ if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
 
     Edges = Mapping[tuple[str, str], RawTrajectory]
-    """Transforms by parent and child frame; of one message at least."""
+    """Transforms by parent and child frame, in the order of recording; of one message at least."""
+
+_DIGITS = 9  # Decimal places of a static transform, in m and of its matrix, below which it is the same
 
 
 def pose_in_tree(edges: Edges, static: Edges, parent: str, child: str, path: Path) -> RawTrajectory:
     """Return ``T_parent_child`` at the times of the most frequent transform between them; the others are interpolated.
+
+    Of a static transform the last value holds throughout, with a note if there are others.
 
     Where one of the others has no value before or after, there is no pose, as in tf2. Raises InputFileError if the frames
     are not connected, or nothing between them moves.
@@ -47,19 +51,27 @@ def pose_in_tree(edges: Edges, static: Edges, parent: str, child: str, path: Pat
     main = max(moving, key=lambda pair: len(moving[pair].stamp_ns))
     stamp_ns = moving[main].stamp_ns
     known = np.ones(len(stamp_ns), dtype=np.bool_)
+    notes: tuple[str, ...] = ()
     T = np.broadcast_to(np.eye(4), (len(stamp_ns), 4, 4))
     for pair, inverted in chain:
         if pair in moving:
             step, inside = _at(moving[pair], stamp_ns)
             known &= inside
         else:
-            step = _matrices(static[pair].select(np.array([0])))
+            # A publisher that was restarted latches again; tf2 replaces the transform, whatever its stamp.
+            fixed = _matrices(static[pair])
+            step = fixed[-1:]
+            different = len(np.unique(fixed.round(_DIGITS), axis=0))
+            if different > 1:
+                notes += (
+                    f"{different} different static transforms from {pair[0]} to {pair[1]}; the last one is used, as in tf2",
+                )
         T = T @ (invert(step) if inverted else step)
     raw = RawTrajectory(
         stamp_ns=stamp_ns,
         position_m=T[:, :3, 3],
         orientation_xyzw=quaternion_from_rotation(T[:, :3, :3]),
-        notes=moving[main].notes,
+        notes=(*moving[main].notes, *notes),
     )
     if known.all():
         return raw

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.figures import curve, panels_height_mm
+from tsgt.analysis.figures import curve, panels_height_mm, stroke
 from tsgt.analysis.report.page import ReportFigure, Section, Table, format_number
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial import preintegrate
@@ -208,13 +208,19 @@ def draw_biases(figure: Figure, biases: _Biases, axis: TimeAxis) -> None:
             centred = values - np.median(values)
             step = max(len(values) // 500, 1)
             panel.fill_between(
-                time[::step], (centred - 2 * sigmas)[::step], (centred + 2 * sigmas)[::step], alpha=0.15
+                time[::step],
+                (centred - 2 * sigmas)[::step],
+                (centred + 2 * sigmas)[::step],
+                color=stroke(row).color,
+                alpha=0.15,
+                linewidth=0,
+                label="band: 2 standard deviations" if first == row == 0 else None,
             )
             curve(panel, time, centred, row, label="xyz"[row] if first == 0 else None)
         panel.set_ylabel(label)
     panels[1].set_xlabel(axis.label)
     figure.align_ylabels(panels)
-    figure.legend(loc="outside upper center", ncols=3)
+    figure.legend(loc="outside upper center", ncols=4)
 
 
 def _triple(values: list[float], digits: int = 3) -> str:

@@ -175,6 +175,29 @@ def test_transform_along_the_tree(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("first_m", "notes"),
+    [
+        (1.0, ("2 different static transforms from base to lidar; the last one is used, as in tf2",)),
+        (0.25, ()),
+    ],
+)
+def test_last_static_transform_holds(tmp_path: Path, first_m: float, notes: tuple[str, ...]) -> None:
+    """A publisher that was restarted latches again: tf2 replaces the transform, a note says that it changed."""
+    start = int(POSES.stamp_ns[0])
+    topics = {
+        "/tf": messages("tf"),
+        "/tf_static": [
+            (start + k, transforms((start + k, "base", "lidar", [x_m, 0.0, 0.0], q)))
+            for k, (x_m, q) in enumerate([(first_m, [0.0, 0.0, 0.0, 1.0]), (0.25, [0.0, 0.0, 0.0, -1.0])])
+        ],
+    }
+    (found,) = read_estimates(write_bag(tmp_path / "run", topics), topics=["/tf:odom.lidar"])
+    rotation = rotation_from_quaternion(POSES.orientation_xyzw)
+    np.testing.assert_allclose(found.position_m, POSES.position_m + 0.25 * rotation[:, :, 0], atol=1e-9)
+    assert found.notes == notes
+
+
 def test_fixes_become_east_north_up(tmp_path: Path) -> None:
     """On the equator at the prime meridian a thousandth of a degree is 111.319 m east; those without a fix are left out."""
     rows = [

@@ -86,6 +86,7 @@ def test_kitti_without_times_names_the_files(tmp_path: Path) -> None:
         "time_s,position_x,position_y,position_z,orientation_x,orientation_y,orientation_z,orientation_w",
         "Stamp [s];X;Y;Z;q_x;q_y;q_z;q_w",
         "header.stamp,position.x,position.y,position.z,orientation.x,orientation.y,orientation.z,orientation.w",
+        "/o/header/stamp,/o/position/x,/o/position/y,/o/position/z,/o/orientation/x,/o/orientation/y,/o/orientation/z,/o/orientation/w",
         "info,t,x,y,z,qx,qy,qz,qw",
         "t x y z qx qy qz qw",
     ],
@@ -106,6 +107,63 @@ def test_names_decide_the_order(tmp_path: Path) -> None:
     ]
     names = "qw,qx,qy,qz,vx,x,y,z,sec,nanosec"
     check_equal(read(tmp_path / "a.csv", "\n".join([names, *lines])))
+
+
+@pytest.mark.parametrize("further", ["", ",status", ",vx,vy,vz,status"])
+def test_own_stamp_of_a_message_comes_first(tmp_path: Path, further: str) -> None:
+    """As bagpy writes it: time of recording, then the stamp in two columns; 12 columns with names are not KITTI's."""
+    lines = [
+        ",".join(
+            [
+                seconds(t + 30_000_000),
+                "7",
+                str(t // 10**9),
+                str(t % 10**9),
+                *map(repr, (*p, *q)),
+                *further.split(",")[1:],
+            ]
+        )
+        for t, p, q in POSES.rows()
+    ]
+    pose = "pose.position.{0},pose.position.{1},pose.position.{2},pose.orientation.{0},pose.orientation.{1},pose.orientation.{2}"
+    names = f"Time,header.seq,header.stamp.secs,header.stamp.nsecs,{pose.format(*'xyz')},pose.orientation.w{further}"
+    check_equal(read(tmp_path / "a.csv", "\n".join([names, *lines])))
+
+
+@pytest.mark.parametrize("comment", ["", "# "])
+def test_twelve_named_columns_are_not_those_of_kitti(tmp_path: Path, comment: str) -> None:
+    """A first line or a comment that names a pose decides, not the number of columns."""
+    names = f"{comment}time,x,y,z,qx,qy,qz,qw,vx,vy,vz,status"
+    lines = [",".join([seconds(t), *map(repr, (*p, *q)), "0", "0", "0", "1"]) for t, p, q in POSES.rows()]
+    check_equal(read(tmp_path / "a.csv", "\n".join([names, *lines])))
+
+
+@pytest.mark.parametrize(
+    ("names", "named"),
+    [
+        ("qx,qy,qz", "qx, qy, qz"),
+        ("q0,q1,q2,q3", "q0, q1, q2, q3"),
+        ("q[0],q[1],q[2],q[3]", "q[0], q[1], q[2], q[3]"),
+        ("qx,qy,qz,qw,imu.orientation.x", "qx, qy, qz, qw, imu.orientation.x"),
+        ("Rotation_X,Rotation_Y,Rotation_Z", "Rotation_X, Rotation_Y, Rotation_Z"),
+        ("q_RS_w,q_RS_x,q_RS_y", "q_RS_w, q_RS_x, q_RS_y"),
+    ],
+)
+def test_orientation_in_part_is_refused(tmp_path: Path, names: str, named: str) -> None:
+    """Without its orientation an estimate has other errors, so it is not left out silently."""
+    count = len(names.split(","))
+    rows = "".join(f"{t},1,2,{t}{',0.5' * count}\n" for t in range(3))
+    with pytest.raises(InputFileError) as refused:
+        read(tmp_path / "a.csv", f"t,x,y,z,{names}\n{rows}")
+    assert f"the columns '{named}' are no whole orientation" in str(refused.value)
+    assert refused.value.line == 1
+
+
+@pytest.mark.parametrize("names", ["yaw", "orientation_covariance.0", "sigma_q_x,status,quality", "q"])
+def test_columns_of_something_else_leave_positions_alone(tmp_path: Path, names: str) -> None:
+    """What is no component of a quaternion is ignored, as any further column."""
+    rows = "".join(f"{t},1,2,{t}{',0.5' * len(names.split(','))}\n" for t in range(3))
+    assert read(tmp_path / "a.csv", f"t,x,y,z,{names}\n{rows}").orientation_xyzw is None
 
 
 def test_positions_only(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -80,6 +81,25 @@ def test_upgrade_leaves_all_until_the_new_environment_is_ready(installed: Path) 
 def test_scripts_are_well_formed(script: str) -> None:
     """By the shell's own parser."""
     subprocess.run(["/bin/sh", "-n", str(SCRIPTS / script)], check=True)
+
+
+@pytest.mark.parametrize(
+    ("version", "code"), [("3.10", 1), ("3.11", 0), ("3.12", 1), ("3.13", 0), ("3.14", 1)]
+)
+def test_python_without_wheels_is_refused_before_anything_is_unpacked(
+    tmp_path: Path, version: str, code: int
+) -> None:
+    """Those of the bundle are for the Pythons of Debian 12 and 13; a refusal later leaves half an installation."""
+    python = tmp_path / "python3"
+    found = tuple(map(int, version.split(".")))
+    pretend = f"import sys; sys.version_info = {(*found, 0)}; exec(sys.stdin.read())"
+    python.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{pretend}'\n")
+    python.chmod(0o755)
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    ran = subprocess.run(["/bin/sh", str(SCRIPTS / "preinst"), "install"], env=environment, check=False)
+    assert ran.returncode == code
+    wheels = (ROOT / "packaging" / "bundle.py").read_text()
+    assert (f'"{version}"' in wheels) == (code == 0)
 
 
 def test_files_of_setup_are_in_the_wheel() -> None:

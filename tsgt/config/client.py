@@ -24,6 +24,8 @@ Baud = Literal[2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_8
 
 PrismType = Literal["round", "mini", "tape", "360", "mini_360", "mini_zero", "user", "grz121", "mpr122"]
 
+MIN_SEARCH_RANGE_M: Final = 10
+
 TemperatureC = Annotated[float, Field(ge=-60, le=70)]
 PressureHpa = Annotated[float, Field(ge=400, le=1200)]
 
@@ -116,6 +118,19 @@ class LeicaInstrumentConfig(Model):
     """Type of targets for single measurements."""
     target_faces: Literal[1, 2] = 1
     """Faces in which a target is measured; two cancel the axis errors and take 10 s longer."""
+
+    @model_validator(mode="after")
+    def _keys_fit_each_other(self) -> LeicaInstrumentConfig:
+        if self.prism_type == "user" and self.prism_constant_mm is None:
+            raise ValueError(
+                'prism_type = "user" needs prism_constant_mm: the instrument may still have the constant of another prism'
+            )
+        min_m, max_m = self.search_distance_m
+        if max_m < min_m + MIN_SEARCH_RANGE_M:
+            raise ValueError(
+                f"search_distance_m: {max_m} must be at least {MIN_SEARCH_RANGE_M} above {min_m}: an instrument accepts no smaller range"
+            )
+        return self
 
 
 class BridgeInstrumentConfig(Model):

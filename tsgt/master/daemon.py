@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
@@ -145,7 +145,6 @@ async def run_master(
         return timeline.unix_ns(clock.monotonic_ns())
 
     start_ns = unix_now_ns()
-    path = new_recording_path(config.recording.directory, "master", start_ns)
     server = StreamServer(
         config.stream.socket,
         encode_line(HelloRecord.of(parameters)),
@@ -153,11 +152,12 @@ async def run_master(
         queue_lines=config.stream.queue_lines,
         unix_now_ns=unix_now_ns,
     )
-    with (
-        ThreadPoolExecutor(1, "imu_setup_check") as checks,
-        RecordingWriter(path, write=dependencies.write, sync=dependencies.sync) as writer,
-        ExitStack() as stack,
-    ):
+    async with AsyncExitStack() as stack:
+        # Before the recording is made: a start that is refused, because another master serves the socket, leaves none.
+        await stack.enter_async_context(server)
+        path = new_recording_path(config.recording.directory, "master", start_ns)
+        checks = stack.enter_context(ThreadPoolExecutor(1, "imu_setup_check"))
+        writer = stack.enter_context(RecordingWriter(path, write=dependencies.write, sync=dependencies.sync))
         recorder = Recorder(writer)
         recording = RecordingThread(recorder, unix_now_ns)
         header = RecordingHeader(
@@ -180,7 +180,7 @@ async def run_master(
             dependencies.observe(record, line)
 
         try:
-            async with server, asyncio.TaskGroup() as group:
+            async with asyncio.TaskGroup() as group:
                 stations = [station.station for station in config.stations]
                 lasting = [
                     OdometryUseMonitor(),

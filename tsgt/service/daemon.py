@@ -66,6 +66,8 @@ async def until_suspended(main: Coroutine[None, None, None]) -> ComputerSuspende
 def run(main: Callable[[], Awaitable[T]]) -> T:
     """Run a coroutine in a new event loop and return its result; SIGINT, SIGTERM and SIGHUP cancel it.
 
+    A SIGHUP that the caller ignores, as nohup does, stays ignored.
+
     Raises
     ------
     TsgtError
@@ -88,7 +90,8 @@ def run(main: Callable[[], Awaitable[T]]) -> T:
                 task.cancel()
 
         loop.add_signal_handler(signal.SIGTERM, terminate)
-        loop.add_signal_handler(signal.SIGHUP, terminate)  # the terminal or the SSH connection is gone
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+            loop.add_signal_handler(signal.SIGHUP, terminate)  # the terminal or the SSH connection is gone
         return await main()
 
     try:

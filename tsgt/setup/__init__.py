@@ -6,7 +6,14 @@ changed twice, and an edited configuration is never replaced unless asked for. `
 units, udev rules, the user, the journal's settings.
 """
 
-from tsgt.setup.answers import NO_INSTRUMENT, MasterAnswers, RadioAnswers, StationAnswers, of_mission
+from tsgt.setup.answers import (
+    NO_INSTRUMENT,
+    MasterAnswers,
+    RadioAnswers,
+    StationAnswers,
+    differing_answers,
+    of_mission,
+)
 from tsgt.setup.configuration import ConfigurationState, State, compare_configuration
 from tsgt.setup.mission import Mission, MissionError, decode_mission, encode_mission, hand_over_lines
 from tsgt.setup.probe import DEFAULT_BAUD, FoundInstrument, Ports, WiringSearch, find_instruments, find_radio
@@ -27,7 +34,7 @@ from tsgt.setup.steps import (
     system_step,
     user_step,
 )
-from tsgt.setup.system import Change, Ran, SetupError, Step, System, carry_out
+from tsgt.setup.system import Change, Ran, SetupError, Step, System, WriteFile, carry_out
 from tsgt.setup.template import client_text, master_text
 
 __all__ = [
@@ -53,12 +60,14 @@ __all__ = [
     "Step",
     "System",
     "WiringSearch",
+    "WriteFile",
     "carry_out",
     "client_text",
     "clock_step",
     "compare_configuration",
     "configuration_step",
     "decode_mission",
+    "differing_answers",
     "encode_mission",
     "find_instruments",
     "find_radio",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 from tsgt.config import (
@@ -15,6 +15,8 @@ from tsgt.config import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from tsgt.config import RadioConfig
     from tsgt.setup.mission import Mission
 
@@ -41,7 +43,7 @@ class RadioAnswers:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StationAnswers:
-    """Answers of a station."""
+    """Answers of a station; ``prism_constant_mm``: None for that of the type."""
 
     station: int
     prism: int
@@ -49,6 +51,7 @@ class StationAnswers:
     baud: int
     checksum: bool
     prism_type: str
+    prism_constant_mm: float | None
     radio: RadioAnswers
 
     @classmethod
@@ -69,6 +72,7 @@ class StationAnswers:
             baud=instrument.baud,
             checksum=instrument.checksum,
             prism_type=instrument.prism_type,
+            prism_constant_mm=instrument.prism_constant_mm,
             radio=radio,
         )
 
@@ -87,6 +91,22 @@ class MasterAnswers:
         if radio is None or not isinstance(config.protocol, SuperframeConfig):
             return None
         return cls(stations=len(config.stations), radio=radio)
+
+
+def differing_answers(
+    before: StationAnswers | MasterAnswers, asked: StationAnswers | MasterAnswers, *, found: Collection[str]
+) -> list[str]:
+    """Return the names of the answers that a configuration has otherwise than asked for.
+
+    ``found``: names of those that nobody asked for, as setup found them itself.
+    """
+    pairs = [(before, asked), (before.radio, asked.radio)]
+    return [
+        each.name
+        for one, other in pairs
+        for each in fields(one)
+        if each.name not in ("radio", *found) and getattr(one, each.name) != getattr(other, each.name)
+    ]
 
 
 def of_mission(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import stat
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import count
 from typing import TYPE_CHECKING, Final, Literal
 
 from tsgt.setup.configuration import State, compare_configuration
@@ -21,6 +23,7 @@ GROUPS: Final = ("spi", "gpio", "dialout")
 USER: Final = "tsgt"
 KEY: Final = "/etc/tsgt/radio.key"
 
+_RELEASES: Final = ("/etc/os-release", "/usr/lib/os-release")
 _BOOT_CONFIGS: Final = ("/boot/firmware/config.txt", "/boot/config.txt")
 _FOLDERS: Final = {
     "systemd": ("/etc/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"),
@@ -59,6 +62,8 @@ def system_step(system: System, role: Role, *, dry_run: bool = False) -> Step:
     name = release.get("PRETTY_NAME", "an unknown operating system")
     python = ".".join(map(str, system.python))
     version = release.get("VERSION_ID", "")
+    if not system.live and not any(system.path(each).exists() for each in _RELEASES):
+        return _problem("system", f"there is no root file system in {system.root}: is the card mounted?")
     old = release.get("ID") in ("debian", "raspbian") and version.isdigit() and int(version) < MIN_DEBIAN
     if old:
         return _problem(
@@ -152,6 +157,9 @@ def key_step(system: System, key: bytes | None, *, replace: bool = False) -> Ste
     ``key``: None: the one that is there is expected. ``replace``: whether another key may be replaced.
     """
     before = (system.read(KEY) or "").strip().lower()
+    if before and (key is None or before == key.hex()) and not _only_for_user(system):
+        write = WriteFile(name=KEY, text=f"{before}\n", mode=0o600, owner=USER)
+        return Step(name="key", detail=f"{KEY}, which again only {USER} can read", changes=(write,))
     if key is None:
         if before:
             return Step(name="key", detail=f"{KEY} is there and stays")
@@ -170,6 +178,14 @@ def key_step(system: System, key: bytes | None, *, replace: bool = False) -> Ste
     return Step(name="key", detail=f"{KEY}, which only {USER} can read", changes=(write,))
 
 
+def _only_for_user(system: System) -> bool:
+    """Whether the key has the owner and mode that the daemon accepts."""
+    status, user = system.path(KEY).stat(), system.user_id(USER)
+    # In an image that is not prepared by root, no file can be given to another user.
+    owned = system.uid != 0 or user is None or status.st_uid == user[0]
+    return owned and stat.S_IMODE(status.st_mode) in (0o600, 0o400)
+
+
 def configuration_step(system: System, role: Role, new: str, *, replace: bool) -> Step:
     """Write the configuration; an edited one only if ``replace``."""
     compared = compare_configuration(system.read(role.config), new, role.config)
@@ -184,7 +200,10 @@ def configuration_step(system: System, role: Role, new: str, *, replace: bool) -
     changes: list[Change] = [WriteFile(name=role.config, text=new)]
     before = system.read(role.config)
     if before is not None and compared.state is State.EDITED:
-        changes.insert(0, WriteFile(name=f"{role.config}.before-setup", text=before))
+        kept = f"{role.config}.before-setup"
+        names = (kept if number == 1 else f"{kept}-{number}" for number in count(1))
+        free = next(name for name in names if not system.path(name).exists())
+        changes.insert(0, WriteFile(name=free, text=before))
     return Step(name="configuration", detail=role.config, changes=tuple(changes))
 
 

@@ -15,9 +15,12 @@ _MARK: Final = "# Checksum of what setup wrote: "
 
 def client_text(answers: StationAnswers) -> str:
     """Return the configuration of a station."""
+    constant_mm = answers.prism_constant_mm
+    constant = "" if constant_mm is None else f"prism_constant_mm = {constant_mm!r}\n"
     return _sealed(f"""\
 # The client of one total station, as `tsgt setup station` wrote it. All keys: docs/reference/configuration.md.
-# Edit it freely, and check it with `sudo tsgt config check`. Setup never replaces an edited file unless asked to.
+# Edit it freely, and check it with `sudo -u tsgt tsgt config check /etc/tsgt/client.toml`. Setup never replaces an edited
+# file unless asked to.
 {_MARK}
 
 kind = "client"
@@ -33,7 +36,7 @@ checksum = {_boolean(answers.checksum)}
 # Reflector on the robot: round, mini, tape, 360, mini_360, mini_zero, grz121, mpr122, or user for any other, which needs
 # prism_constant_mm as well. The instrument adds its constant, so the master's prism_constant_mm is 0.
 prism_type = {_quoted(answers.prism_type)}
-search_window_deg = 40.0        # width of the search window for a lost prism; 360: all around
+{constant}search_window_deg = 40.0        # width of the search window for a lost prism; 360: all around
 search_height_deg = 15.0
 target = "foil"                 # type of targets of `tsgt calibrate collect`: foil or prism
 
@@ -60,7 +63,8 @@ def master_text(answers: MasterAnswers) -> str:
     )
     return _sealed(f"""\
 # The master on the robot, as `tsgt setup master` wrote it. All keys: docs/reference/configuration.md.
-# Edit it freely, and check it with `sudo tsgt config check`. Setup never replaces an edited file unless asked to.
+# Edit it freely, and check it with `sudo -u tsgt tsgt config check /etc/tsgt/master.toml`. Setup never replaces an edited
+# file unless asked to.
 {_MARK}
 
 kind = "master"

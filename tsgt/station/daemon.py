@@ -53,14 +53,15 @@ async def run_client(config: ClientConfig, settings: LoRaSettings, dependencies:
     created: another client serves it.
     """
     requested = RequestedAtmosphere()
-    while True:
-        watch = SuspensionWatch(dependencies.suspended_ns)
-        run = _run_until_suspended(
-            config, settings, replace(dependencies, boot=watch.boot(dependencies.boot)), watch, requested
-        )
-        suspended = await service.until_suspended(run)
-        log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
-        dependencies.instrument.host_clock_restarted()
+    # Before a journal is made: a start that is refused, because another client serves the socket, leaves none.
+    with ControlSocket(config.status_socket) as control_socket:
+        while True:
+            watch = SuspensionWatch(dependencies.suspended_ns)
+            booted = replace(dependencies, boot=watch.boot(dependencies.boot))
+            run = _run_until_suspended(config, settings, booted, watch, requested, control_socket)
+            suspended = await service.until_suspended(run)
+            log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
+            dependencies.instrument.host_clock_restarted()
 
 
 async def _run_until_suspended(
@@ -69,6 +70,7 @@ async def _run_until_suspended(
     dependencies: ClientDependencies,
     watch: SuspensionWatch,
     requested: RequestedAtmosphere,
+    control_socket: ControlSocket,
 ) -> None:
     """Run until cancelled. Raises ComputerSuspendedError after a resume: nothing then compares with times from before.
 
@@ -118,30 +120,29 @@ async def _run_until_suspended(
         with suppress(RecordingError):
             writer.sync()
         try:
-            with ControlSocket(config.status_socket) as control_socket:
-                async with asyncio.TaskGroup() as group:
-                    client = _StationClient(
-                        config,
-                        settings,
-                        dependencies,
-                        watch,
-                        requested,
-                        timeline,
-                        recorder,
-                        journal,
-                        path,
-                        backlog,
-                        group,
-                    )
-                    log.info("client_started", station=config.station, journal=str(path))
-                    group.create_task(journal.run())
-                    group.create_task(
-                        service.sync_periodically(writer.sync, clock, config.journal.fsync_interval_s)
-                    )
-                    group.create_task(client.supervisor.run())
-                    group.create_task(supervise_radio(dependencies.open_radio, client.run_link, clock))
-                    group.create_task(control_socket.serve(client.status, client.handle_request))
-                    group.create_task(service.notify_systemd(client.status_line, clock))
+            async with asyncio.TaskGroup() as group:
+                client = _StationClient(
+                    config,
+                    settings,
+                    dependencies,
+                    watch,
+                    requested,
+                    timeline,
+                    recorder,
+                    journal,
+                    path,
+                    backlog,
+                    group,
+                )
+                log.info("client_started", station=config.station, journal=str(path))
+                group.create_task(journal.run())
+                group.create_task(
+                    service.sync_periodically(writer.sync, clock, config.journal.fsync_interval_s)
+                )
+                group.create_task(client.supervisor.run())
+                group.create_task(supervise_radio(dependencies.open_radio, client.run_link, clock))
+                group.create_task(control_socket.serve(client.status, client.handle_request))
+                group.create_task(service.notify_systemd(client.status_line, clock))
         finally:
             recorder.close()
             log.info("client_stopped", station=config.station)

@@ -40,8 +40,24 @@ print(run(main))
 """
 
 
-def ended_by(number: signal.Signals, program: str) -> tuple[int, list[str]]:
-    """Run a program, send it a signal, return its exit code and its output."""
+HUNG_UP = """
+import asyncio, os, signal
+from tsgt.service import run
+
+async def main():
+    print("running", flush=True)
+    os.kill(os.getpid(), signal.SIGHUP)
+    await asyncio.sleep(0.1)
+    print("still running", flush=True)
+    await asyncio.sleep(600)
+
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+run(main)
+"""
+
+
+def ended_by(number: signal.Signals, program: str, *, after_lines: int = 1) -> tuple[int, list[str]]:
+    """Run a program, send it a signal after its first lines, return its exit code and its output."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(
         [sys.executable, "-c", program],
@@ -51,13 +67,13 @@ def ended_by(number: signal.Signals, program: str) -> tuple[int, list[str]]:
         env=environment,
     ) as process:
         assert process.stdout is not None
-        lines = [process.stdout.readline()]
+        lines = [process.stdout.readline() for _ in range(after_lines)]
         process.send_signal(number)
         try:
             rest, _ = process.communicate(timeout=TIMEOUT_S)
         finally:
             process.kill()
-        return process.returncode, (lines[0] + rest).splitlines()
+        return process.returncode, ("".join(lines) + rest).splitlines()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -77,3 +93,8 @@ def test_sigint_ends_a_program_cleanly() -> None:
 def test_program_may_return_a_result_after_a_signal(number: signal.Signals) -> None:
     """It catches the cancellation."""
     assert ended_by(number, SUMMING_UP) == (0, ["running", "summary"])
+
+
+def test_program_under_nohup_survives_the_end_of_its_terminal() -> None:
+    """SIGHUP stays ignored where the caller ignores it."""
+    assert ended_by(signal.SIGTERM, HUNG_UP, after_lines=2) == (0, ["running", "still running"])

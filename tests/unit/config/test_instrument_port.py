@@ -1,7 +1,8 @@
-"""The port of an instrument: a device, or an address in the network."""
+"""Keys of an instrument: its port, a device or an address in the network; reflector and search."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -59,3 +60,27 @@ def test_wrong_address_is_one_line(port: object) -> None:
     with pytest.raises(ValidationError, match=r"tcp://HOST:PORT") as refused:
         config(port)
     assert refused.value.error_count() == 1
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"prism_type": "user"}, 'prism_type = "user" needs prism_constant_mm'),
+        ({"search_distance_m": (100, 20)}, "search_distance_m: 20 must be at least 10 above 100"),
+        ({"search_distance_m": (100, 109)}, "search_distance_m: 109 must be at least 10 above 100"),
+    ],
+)
+def test_keys_that_contradict_each_other_are_refused(keys: dict[str, object], problem: str) -> None:
+    """The distances would be off by what the last surveyor left; the prism would not be searched where it is."""
+    good = {"kind": "leica", "port": "/dev/ttyUSB0", "prism_type": "round"}
+    with pytest.raises(ValidationError, match=re.escape(problem)):
+        LeicaInstrumentConfig.model_validate({**good, **keys}, context={"folder": ""})
+
+
+def test_instrument_may_search_ten_metres() -> None:
+    """The least that it accepts."""
+    good = {"kind": "leica", "port": "/dev/ttyUSB0", "prism_type": "user", "prism_constant_mm": 0.0}
+    config = LeicaInstrumentConfig.model_validate(
+        {**good, "search_distance_m": (100, 110)}, context={"folder": ""}
+    )
+    assert config.search_distance_m == (100, 110)

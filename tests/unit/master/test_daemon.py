@@ -21,7 +21,7 @@ from harness.instruments.bridge import FakeStart
 from harness.missions.field import DISK, STATIONS, TRUE, field_of, running
 
 from tsgt.config import AlarmsConfig, GeofenceConfig, ImuConfig
-from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError
+from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError, StreamError
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.monitors.geofence import run_geofence_command
 from tsgt.master.monitors.imu import ImuUseMonitor
@@ -226,6 +226,15 @@ async def test_recording_equals_stream_and_replay(tmp_path: Path, protocol: dict
     assert [line.data for line in lines[2:]] == streamed
     assert [line for _, some in replayed(field.recording()) for line in some] == streamed
     assert {"geofence_exited", "geofence_entered", "station_lost 3"} <= set(events(field))
+
+
+async def test_second_master_leaves_no_recording(tmp_path: Path) -> None:
+    """Another one serves the socket; systemd would start it every two seconds."""
+    async with field_of(tmp_path, DRIVING) as field, running(field.master()):
+        await asyncio.sleep(1)
+        with pytest.raises(StreamError, match="another program serves this socket"):
+            await field.master()
+    assert len(list((tmp_path / "recordings").iterdir())) == 1
 
 
 async def test_master_that_is_stopped_as_its_computer_resumes_ends(tmp_path: Path) -> None:
@@ -441,13 +450,14 @@ async def test_master_stops_within_a_second_and_restarts(tmp_path: Path, at_ms: 
         await asyncio.wait([task])
         assert TRUE.monotonic_ns() - stopped_ns < 1000 * MS
         assert task.cancelled()
-        lines = [line.data for line in read_lines(field.recording())]
-        assert lines[2:] == [encode_line(record) for record in field.records]
+        if at_ms:  # earlier it has neither socket nor recording
+            lines = [line.data for line in read_lines(field.recording())]
+            assert lines[2:] == [encode_line(record) for record in field.records]
         field.records.clear()
         async with running(field.master()):
             await asyncio.sleep(12)
         assert field.of(PoseRecord)[-1].valid
-        assert len(list((tmp_path / "recordings").iterdir())) == 2
+        assert len(list((tmp_path / "recordings").iterdir())) == (2 if at_ms else 1)
 
 
 @pytest.mark.slow

@@ -328,8 +328,9 @@ async def test_status_reports_instrument_master_and_journal(tmp_path: Path) -> N
 
 
 async def test_second_client_does_not_take_socket(tmp_path: Path) -> None:
-    """Two clients with one configuration are a mistake; the error says so."""
+    """Two clients with one configuration are a mistake; the error says so, and no journal is left of it."""
     async with field_day(tmp_path) as day:
+        files = all_files(tmp_path)
         with pytest.raises(StreamError, match="another program serves this socket"):
             await run_client(
                 client_config(tmp_path),
@@ -338,6 +339,12 @@ async def test_second_client_does_not_take_socket(tmp_path: Path) -> None:
                     instrument=ScriptedInstrument(day.clock), open_radio=day.open_radio, clock=day.clock
                 ),
             )
+        assert all_files(tmp_path) == files
+
+
+def all_files(folder: Path) -> list[Path]:
+    """Return all files in a folder."""
+    return sorted(folder.rglob("*"))
 
 
 async def client_status(path: Path) -> dict[str, Any]:
@@ -364,7 +371,7 @@ async def test_client_that_is_stopped_as_its_computer_resumes_ends(tmp_path: Pat
             instrument=ScriptedInstrument(day.clock), open_radio=day.open_radio, clock=day.clock
         )
         with patch("tsgt.station.daemon._run_until_suspended", resumed):
-            task = asyncio.create_task(run_client(client_config(tmp_path), PAPER, dependencies))
+            task = asyncio.create_task(run_client(client_config(tmp_path / "second"), PAPER, dependencies))
             await asyncio.sleep(0.1)
             task.cancel()
             await asyncio.wait([task], timeout=1.0)

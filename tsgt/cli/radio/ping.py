@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import math
 import secrets
 from contextlib import aclosing, suppress
 from typing import TYPE_CHECKING, Any
@@ -31,10 +32,10 @@ from tsgt.radio.ping import (
 )
 from tsgt.radio.planning import (
     CHANNELS,
-    DIPOLE_DBI,
     MIN_POWER_DBM,
     REGIONS,
     Channel,
+    duty_cycle_limit,
     power_limit_dbm,
     preset_power_dbm,
 )
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 DEFAULT_COUNT = 100
 SIMULATED_FREQUENCY_MHZ = 905.0
 _ROUNDING_DB = 1e-9  # of sums of gains
+_HOUR_MS = 3_600_000
 REPLY_MARGIN_MS = 250
 """Added to the reply's time on air: the timeout of the authors' master."""
 
@@ -92,13 +94,14 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
 @click.option(
     "--region",
     type=click.Choice(sorted(REGIONS)),
-    help="Use the power that the region allows on this channel; reject a channel or a power that it does not allow.",
+    help="Use the power that the region allows on this channel; reject a channel, power or --count that it does not allow.",
 )
 @click.option(
     "--power-dbm",
     type=click.IntRange(2, 17),
     help="Transmit power.  [default: that of --region, else 2, which suffices within a building]",
 )
+@model_option(ModemConfig, "antenna_gain_dbi")
 @click.option(
     "--sync-word", callback=_byte, default="0x34", help="Sync word, one byte, the same on both sides."
 )
@@ -122,6 +125,7 @@ def ping_command(
     frequency_mhz: float | None,
     region: str | None,
     power_dbm: int | None,
+    antenna_gain_dbi: float,
     sync_word: int,
     wiring: Wiring,
     distance_m: float,
@@ -144,7 +148,16 @@ def ping_command(
         frequency_mhz = SIMULATED_FREQUENCY_MHZ
     frequency_hz = round(frequency_mhz * 1e6)
     if region is not None:
-        power_dbm = _legal_power_dbm(region, frequency_hz, modem.bandwidth_hz, power_dbm)
+        channel = Channel(frequency_hz, modem.bandwidth_hz)
+        power_dbm = _legal_power_dbm(region, channel, power_dbm, antenna_gain_dbi)
+        # A reply is as long as its request, whose length the side that responds does not know.
+        longest_bytes = MAX_PAYLOAD_BYTES if answering else payload_bytes
+        _check_duty_cycle(
+            region,
+            channel,
+            count=count if answering else count or DEFAULT_COUNT,
+            airtime_ms=airtime_us(longest_bytes, **dataclasses.asdict(modem)) / 1000,
+        )
     settings = LoRaSettings(
         frequency_hz=frequency_hz,
         **dataclasses.asdict(modem),
@@ -219,20 +232,39 @@ def _print_summary(summary: Summary, statistics: RadioStatistics) -> None:
     click.echo(f"turnaround   {_times_text(summary.turnaround_ns)}, RxDone to start of the reply, there")
 
 
-def _legal_power_dbm(region: str, frequency_hz: int, bandwidth_hz: int, power_dbm: int | None) -> int:
-    """Return the power with a dipole; raises RadioSettingsError if the region does not allow it."""
-    channel = Channel(frequency_hz, bandwidth_hz)._asdict()
+def _legal_power_dbm(region: str, channel: Channel, power_dbm: int | None, antenna_gain_dbi: float) -> int:
+    """Return the power; raises RadioSettingsError if the region does not allow it."""
     if power_dbm is None:
-        power_dbm = preset_power_dbm(region, **channel)
-    limit_dbm = power_limit_dbm(region, **channel, antenna_gain_dbi=DIPOLE_DBI)
-    if power_dbm > limit_dbm + _ROUNDING_DB:
+        power_dbm = preset_power_dbm(region, **channel._asdict(), antenna_gain_dbi=antenna_gain_dbi)
+    limit_dbm = power_limit_dbm(region, **channel._asdict(), antenna_gain_dbi=antenna_gain_dbi)
+    excess_db = power_dbm - limit_dbm
+    if excess_db <= _ROUNDING_DB:
+        return power_dbm
+    legal = CHANNELS[region]
+    remedy = f"a legal channel: --frequency-mhz {legal.frequency_hz / 1e6:g} --bandwidth-khz {legal.bandwidth_hz / 1e3:g}"
+    if channel == legal:
+        gain_dbi = math.floor(10 * (antenna_gain_dbi - excess_db) + _ROUNDING_DB) / 10
+        remedy = f"with an attenuator of {math.ceil(10 * excess_db - _ROUNDING_DB) / 10:.1f} dB: --antenna-gain-dbi {gain_dbi:g}"
+    raise RadioSettingsError(
+        f"{region} allows {limit_dbm:.1f} dBm into an antenna of {antenna_gain_dbi:g} dBi at "
+        f"{channel.frequency_hz / 1e6:g} MHz and {channel.bandwidth_hz / 1e3:g} kHz, and {power_dbm} dBm would be "
+        f"transmitted; {remedy}"
+    )
+
+
+def _check_duty_cycle(region: str, channel: Channel, *, count: int | None, airtime_ms: float) -> None:
+    """Raise RadioSettingsError if ``count`` packets (None: without end) take longer than the region allows in an hour."""
+    duty_cycle = duty_cycle_limit(region, **channel._asdict())
+    if duty_cycle is None:
+        return
+    most = int(duty_cycle * _HOUR_MS / airtime_ms)
+    if count is None or count > most:
         legal = CHANNELS[region]
         raise RadioSettingsError(
-            f"{region} allows {limit_dbm:.1f} dBm into a dipole at {frequency_hz / 1e6:g} MHz and {bandwidth_hz / 1e3:g} kHz, "
-            f"and {power_dbm} dBm would be transmitted; a legal channel: --frequency-mhz {legal.frequency_hz / 1e6:g} "
-            f"--bandwidth-khz {legal.bandwidth_hz / 1e3:g}"
+            f"{region} allows a radio to transmit for {100 * duty_cycle:g} % of any hour at {channel.frequency_hz / 1e6:g} MHz, "
+            f"and a packet takes {airtime_ms:.0f} ms: --count {most} at most, in all tests of an hour; without "
+            f"this limit: --frequency-mhz {legal.frequency_hz / 1e6:g} --bandwidth-khz {legal.bandwidth_hz / 1e3:g}"
         )
-    return power_dbm
 
 
 def _answer(settings: LoRaSettings, wiring: Wiring, *, count: int | None, as_json: bool) -> None:

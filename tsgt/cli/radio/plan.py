@@ -167,14 +167,20 @@ def plan_command(
         return _Row(settings, stations, received_dbm - needed_dbm, planned_cycle(spoken, load, settings))
 
     planned = row(settings, stations)
+
+    def rows(numbers: Sequence[int]) -> list[_Row]:
+        return [
+            row(replace(settings, spreading_factor=sf, coding_rate=coding_rate), n)
+            for sf in range(7, 13)
+            for coding_rate in range(5, 9)
+            for n in numbers
+        ]
+
     numbers = sorted({stations, *(n for n in _TABLE_STATIONS if n <= MAX_STATION_NUMBERS[protocol])})
-    table = [
-        row(replace(settings, spreading_factor=sf, coding_rate=coding_rate), n)
-        for sf in range(7, 13)
-        for coding_rate in range(5, 9)
-        for n in numbers
-    ]
-    warnings = _warnings(planned, table, spoken, rate_hz=rate_hz)
+    table = rows(numbers) if with_table else []  # takes many seconds on a station's computer
+    complete = planned.cycle.rate_hz >= _COMPLETE * rate_hz
+    others = [] if complete else [each for each in table or rows([stations]) if each.stations == stations]
+    warnings = _warnings(planned, others, spoken, rate_hz=rate_hz)
     use = planned.use(antenna_gain_dbi)
     if chip := chip_violation(use):
         warnings.append(chip)
@@ -260,14 +266,11 @@ def _figures(cycle: CycleEstimate) -> dict[str, Any]:
     }
 
 
-def _warnings(planned: _Row, table: Sequence[_Row], spoken: MasterProtocol, *, rate_hz: float) -> list[str]:
+def _warnings(planned: _Row, others: Sequence[_Row], spoken: MasterProtocol, *, rate_hz: float) -> list[str]:
+    """Return the warnings; ``others``: with other settings, where a remedy is needed."""
     found = []
     if planned.cycle.rate_hz < _COMPLETE * rate_hz:
-        enough = [
-            row
-            for row in table
-            if row.stations == planned.stations and row.cycle.rate_hz >= _COMPLETE * rate_hz
-        ]
+        enough = [row for row in others if row.cycle.rate_hz >= _COMPLETE * rate_hz]
         remedies = [
             f"SF {row.settings.spreading_factor} with 4/{row.settings.coding_rate}, link margin {row.margin_db:.0f} dB"
             for row in sorted(enough, key=lambda row: -row.margin_db)[:1]

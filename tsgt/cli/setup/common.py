@@ -5,6 +5,8 @@ from __future__ import annotations
 import secrets
 import time
 from contextlib import aclosing
+from dataclasses import replace
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, TypeVar
 
 import click
@@ -21,12 +23,17 @@ from tsgt.log import configure_logging
 from tsgt.radio import LoRaSettings
 from tsgt.radio.planning import DIPOLE_DBI, MIN_POWER_DBM
 from tsgt.setup import (
+    KEY,
     USER,
+    SetupError,
     State,
+    Step,
     WiringSearch,
+    WriteFile,
     clock_step,
     compare_configuration,
     configuration_step,
+    differing_answers,
     find_radio,
     journal_step,
     key_step,
@@ -40,13 +47,13 @@ from tsgt.setup import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Sequence
     from pathlib import Path
 
     from tsgt.cli.setup.options import Common
     from tsgt.cli.setup.session import Session
     from tsgt.doctor import Finding
-    from tsgt.setup import Mission, RadioAnswers
+    from tsgt.setup import MasterAnswers, Mission, RadioAnswers, StationAnswers
 
 M = TypeVar("M", bound=Model)
 
@@ -67,6 +74,20 @@ def prepare(session: Session) -> None:
         if not spi_devices(system):
             session.fail("spi", "enabled, but there is no /dev/spidev* before the next boot: sudo reboot")
     session.do(user_step(system))
+
+
+def differing(
+    common: Common,
+    before: StationAnswers | MasterAnswers | None,
+    answers: StationAnswers | MasterAnswers,
+    *,
+    found: Collection[str] = (),
+) -> list[str]:
+    """Return the names of the answers that the configuration of before has otherwise; ``found``: not asked for."""
+    if before is None:
+        return []
+    wiring = ("wiring",) if common.search == WiringSearch() else ()
+    return differing_answers(before, answers, found=(*found, *wiring))
 
 
 def configuration_before(session: Session, model: type[M]) -> M | None:
@@ -104,14 +125,26 @@ def radio_of(session: Session, common: Common, mission: Mission, before: RadioAn
         power_dbm=MIN_POWER_DBM,
     )
     wiring = _wiring(session, common, settings, None if before is None else before.wiring)
-    licence, power_dbm = (None, None) if before is None else (before.licence, before.power_dbm)
-    return of_mission(
-        mission,
-        antenna_gain_dbi=gain_dbi,
-        licence=common.licence or licence,
-        power_dbm=power_dbm,
-        wiring=wiring,
+    radio = of_mission(
+        mission, antenna_gain_dbi=gain_dbi, licence=common.licence, power_dbm=None, wiring=wiring
     )
+    if before is None:
+        return radio
+    if _channel(before) == _channel(radio):
+        return replace(radio, licence=common.licence or before.licence, power_dbm=before.power_dbm)
+    if before.licence is not None and common.licence is None:
+        # It would lift the limits of another country.
+        session.report(
+            "licence",
+            ok=True,
+            detail=f'the licence "{before.licence}" is for the former channel, and is not kept; --licence states one',
+        )
+    return radio
+
+
+def _channel(radio: RadioAnswers) -> tuple[str | None, float, float]:
+    """Return what licence and power are valid for."""
+    return radio.region, radio.frequency_mhz, radio.bandwidth_khz
 
 
 def _wiring(
@@ -168,18 +201,26 @@ def configure(
     text: str | None,
     *,
     key: bytes | None,
+    contradicted: Sequence[str] = (),
     expected: Collection[str] = (),
     network: bool = False,
 ) -> None:
     """Install key, configuration and service, check the machine, and start the service.
 
-    ``text``: of the configuration; None keeps the one that is there. ``expected``: checks that fail until the machine is
-    complete, because the instrument is still missing.
-    ``network``: whether the instrument is in the network, which the service may use then.
+    ``text``: of the configuration; None keeps the one that is there. ``contradicted``: names of the answers that the one
+    that is there has otherwise. ``expected``: checks that fail until the machine is complete, because the instrument is
+    still missing. ``network``: whether the instrument is in the network, which the service may use then.
     """
     system, role = session.system, session.role
-    changed = session.do(key_step(system, key, replace=common.replace_key))
-    changed |= _place_configuration(session, common, text)
+    placing_key = key_step(system, key, replace=common.replace_key)
+    if not placing_key.ok:
+        session.do(placing_key)
+    # Before the key is replaced: with the key of one mission and the channel of another it could talk to neither.
+    placing, checked = _configuration(session, common, text, contradicted, new_key=key is not None)
+    changed = session.do(placing_key)
+    if not session.dry_run:
+        _check(session, checked)
+    changed |= session.do(placing)
     changed |= session.do(services_step(system, role, network=network))
     session.do(journal_step(system))
     session.do(clock_step(system, role))
@@ -189,7 +230,23 @@ def configure(
     session.do(start_step(system, role, changed=changed))
 
 
-def _place_configuration(session: Session, common: Common, text: str | None) -> bool:
+def keep_configuration(session: Session, common: Common, options: dict[str, object]) -> None:
+    """Set up the rest of a machine that has a configuration of a kind that setup does not write; ``options``: for it."""
+    options |= {"--antenna-gain-dbi": common.antenna_gain_dbi, "--licence": common.licence}
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        session.fail(
+            "configuration",
+            f"{session.role.config} stays, as its instrument, radio or protocol is of a kind that setup does not write: "
+            f"{', '.join(given)} would not be in force; edit it, or --replace-config",
+        )
+    configure(session, common, None, key=None)
+
+
+def _configuration(
+    session: Session, common: Common, text: str | None, contradicted: Sequence[str], *, new_key: bool
+) -> tuple[Step, str]:
+    """Return the step that writes the configuration, or keeps the one of before, and the text that is then in force."""
     system, role = session.system, session.role
     before = system.read(role.config)
     if text is None:
@@ -198,36 +255,47 @@ def _place_configuration(session: Session, common: Common, text: str | None) -> 
     compared = compare_configuration(before, text, role.config)
     for line in compared.differences:
         session.say(f"{'':8}{line}")
-    replace = common.replace_config
-    if compared.differences and session.ask and not replace and not session.dry_run:
+    replacing, declined = common.replace_config, False
+    if compared.differences and session.ask and not replacing and not session.dry_run:
         default = compared.state is State.FROM_SETUP
-        replace = click.confirm(f"Replace {role.config} by these lines (+)?", default=default)
-        if not replace:
-            text = before or text
-    step = configuration_step(system, role, text, replace=replace)
+        replacing = click.confirm(f"Replace {role.config} by these lines (+)?", default=default)
+        declined = not replacing
+    stays = declined or (compared.state is State.EDITED and not replacing)
+    if stays and contradicted:
+        session.fail(
+            "configuration",
+            f"{role.config} stays as it was, with other values than asked for: {', '.join(contradicted)}; --replace-config "
+            "replaces it",
+        )
+    step = configuration_step(system, role, text, replace=replacing)
+    if declined:
+        step = Step(name="configuration", detail=f"{role.config} stays as it was")
+    checked = before if stays and before is not None else text
     if not session.dry_run:
-        checked = text if step.changes else before or text
-        problems = _problems(session, checked)
-        if problems:
-            session.fail("configuration", problems[0])
-    return session.do(step)
+        _check(session, checked, without_key=new_key)
+    return step, checked
 
 
-def _problems(session: Session, text: str) -> list[str]:
-    """Return what would keep the daemon from starting with a configuration, checked before it is put into its place."""
+def _check(session: Session, text: str, *, without_key: bool = False) -> None:
+    """Stop the setup if the daemon would not start with a configuration, before that is put into its place."""
     system, role = session.system, session.role
     path = system.path(role.config)
     trial = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.toml")
     user = system.user_id(USER)
     try:
-        trial.write_text(text, encoding="utf-8")
+        WriteFile(name=f"{PurePosixPath(role.config).parent}/{trial.name}", text=text).carry_out(system)
         content, problems = find_problems(trial)
         if content is not None:
             owner = user[0] if system.uid == 0 and user is not None else None
             problems = problems_at_start(trial, content, key_owner=owner)
+    except SetupError as error:
+        session.fail("configuration", str(error))
     finally:
         trial.unlink(missing_ok=True)
-    return [str(problem).replace(str(trial), role.config) for problem in problems]
+    key = system.path(KEY).absolute()
+    for problem in problems:
+        if not (without_key and problem.path is not None and problem.path.absolute() == key):
+            session.fail("configuration", str(problem).replace(str(trial), role.config))
 
 
 def _check_machine(session: Session, expected: Collection[str]) -> None:

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.cli.setup.common import configuration_before, configure, prepare, radio_of
+from tsgt.cli.setup.common import (
+    configuration_before,
+    configure,
+    differing,
+    keep_configuration,
+    prepare,
+    radio_of,
+)
 from tsgt.cli.setup.mission import channel_text, mission_key, mission_of, mission_of_master, show_mission
 from tsgt.cli.setup.options import answer
 from tsgt.cli.setup.session import SetupStopped
@@ -33,7 +40,7 @@ def run_master_setup(common: Common, *, region: str | None, stations: int | None
         config = configuration_before(session, MasterConfig)
         before = None if config is None else MasterAnswers.of(config)
         if config is not None and before is None and not common.replace_config:
-            configure(session, common, None, key=None)
+            keep_configuration(session, common, {"--region": region, "--stations": stations})
             return session.finish()
         chosen_region = answer(
             session,
@@ -66,7 +73,9 @@ def run_master_setup(common: Common, *, region: str | None, stations: int | None
         )
         radio = radio_of(session, common, shared, None if before is None else before.radio)
         answers = MasterAnswers(stations=count, radio=radio)
-        configure(session, common, master_text(answers), key=key)
+        configure(
+            session, common, master_text(answers), key=key, contradicted=differing(common, before, answers)
+        )
     except SetupStopped:
         pass
     code = session.finish()

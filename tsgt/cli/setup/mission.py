@@ -82,7 +82,7 @@ def given_mission(session: Session, given: str | None, before: Mission | None) -
 
 def _content(given: str) -> str:
     """Return the content of a file, or the given text itself."""
-    if "/" in given and given.lstrip().upper().startswith("TSGT1/"):
+    if re.sub(r"\s", "", given).upper().startswith("TSGT1/"):  # the groups to read out have spaces in it
         return given
     try:
         with open(given, encoding="utf-8", errors="replace") as file:  # noqa: PTH123 (a text may be no path at all)

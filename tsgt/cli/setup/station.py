@@ -13,7 +13,9 @@ from tsgt.cli import doctor
 from tsgt.cli.setup.common import (
     configuration_before,
     configure,
+    differing,
     is_running,
+    keep_configuration,
     prepare,
     radio_of,
 )
@@ -62,7 +64,17 @@ def run_station_setup(
         config = configuration_before(session, ClientConfig)
         before = None if config is None else StationAnswers.of(config)
         if config is not None and before is None and not common.replace_config:
-            configure(session, common, None, key=None)
+            keep_configuration(
+                session,
+                common,
+                {
+                    "--station": station,
+                    "--prism": prism,
+                    "--mission": mission,
+                    "--instrument": instrument,
+                    "--prism-type": prism_type,
+                },
+            )
             return session.finish()
         shared = _mission(session, mission, config if before is not None else None)
         number = answer(
@@ -87,7 +99,7 @@ def run_station_setup(
             prism_type,
             "--prism-type",
             "Reflector on the robot",
-            click.Choice(PRISM_TYPES),
+            click.Choice(list(dict.fromkeys([*PRISM_TYPES, *([before.prism_type] if before else [])]))),
             _of(before, "prism_type") or (DEFAULT_PRISM_TYPE if session.ask else None),
         )
         radio = radio_of(session, common, shared, None if before is None else before.radio)
@@ -99,6 +111,7 @@ def run_station_setup(
             baud=baud,
             checksum=before.checksum if before is not None else False,
             prism_type=reflector,
+            prism_constant_mm=before.prism_constant_mm if before and before.prism_type == reflector else None,
             radio=radio,
         )
         expected = _WITHOUT_INSTRUMENT if port == NO_INSTRUMENT else ()
@@ -107,6 +120,9 @@ def run_station_setup(
             common,
             client_text(answers),
             key=shared.key,
+            contradicted=differing(
+                common, before, answers, found=("baud", "port") if instrument is None else ("baud",)
+            ),
             expected=expected,
             network=port.startswith("tcp://"),
         )

@@ -8,6 +8,7 @@ extra and depends on the model: 50 to 130 ms for the simulated ones.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -156,7 +157,7 @@ def superframe_cycle(load: TrafficLoad, timing: FrameTiming, *, phase_lock: bool
         frame_ns = needed_ns
         slot = _slot(load, timing, frame_ns / load.period_ns)
         needed_ns = fixed_ns + (load.stations - 1) * slot.granted_ns + slot.sent_ns
-    waits = [_Waits(frame_ns, [frame_ns * (k + 0.5) / _WAIT_SAMPLES for k in range(_WAIT_SAMPLES)])]
+    waits = [_Waits(frame_ns, tuple(frame_ns * (k + 0.5) / _WAIT_SAMPLES for k in range(_WAIT_SAMPLES)))]
     if phase_lock:
         frame = _Frame(
             duration_ns=frame_ns,
@@ -207,9 +208,11 @@ def _slot(load: TrafficLoad, timing: FrameTiming, per_frame: float) -> _Slot:
         for count, share in ((int(expected), 1 - expected % 1), (int(expected) + 1, expected % 1)):
             for extended, part in ((False, 1 - 1 / EXCHANGE_INTERVAL), (True, 1 / EXCHANGE_INTERVAL)):
                 weight = (1 - failed) * failed**silent * share * part
-                predicted = demand.Demand(max(count, 1), extended=extended)
+                # A reply carries no more; the lengths of replies are cached, and after many silent frames counts are large.
+                sendable = min(count, demand.MAX_MEASUREMENTS)
+                predicted = demand.Demand(max(sendable, 1), extended=extended)
                 longest = GRANT_BYTES[demand.grant(predicted, cap=cap, silent_frames=silent)]
-                sent = min(demand.demand_bytes(replace(predicted, measurements=count)), longest)
+                sent = min(demand.demand_bytes(replace(predicted, measurements=sendable)), longest)
                 granted_ns += weight * timing.airtime_ns(longest)
                 squared += weight * timing.airtime_ns(longest) ** 2
                 sent_ns += weight * timing.airtime_ns(sent)
@@ -244,7 +247,7 @@ class _Waits(NamedTuple):
     """Waits of measurements until a reply is composed, equally likely; and the mean cycle."""
 
     cycle_ns: float
-    waits_ns: Sequence[float]
+    waits_ns: tuple[float, ...]
 
 
 def _phases(stations: int) -> Iterator[list[float]]:
@@ -274,14 +277,14 @@ def _locked(load: TrafficLoad, frame: _Frame, phases: Sequence[float]) -> _Waits
         return None
     # The period holds as many whole frames as fit.
     frames = max(int(period_ns / frame.duration_ns), 1)
-    waits_ns = [
+    waits_ns = tuple(
         min((wait_ns + k * frame.duration_ns) % period_ns for k in range(frames))
         + MIN_MARGIN_NS
         + delay_ns
         + later * period_ns
         for wait_ns in best
         for later in range(periods)
-    ]
+    )
     return _Waits(periods * period_ns / frames, waits_ns)
 
 
@@ -292,9 +295,10 @@ def _orders(stations: int) -> list[SlotOrder]:
 def _quantiles(frames_waits: Sequence[_Waits], success: float) -> tuple[float, float]:
     """Return median and 99th percentile of the waits, extended by whole frames until a reply is received."""
     weighted = []
-    for waits in frames_waits:
+    # Frames that are not locked have the same waits at all phases: at a high loss these are long lists.
+    for waits, sets in Counter(frames_waits).items():
         for frames in range(1000):
-            share = success * (1 - success) ** frames / len(waits.waits_ns)
+            share = sets * success * (1 - success) ** frames / len(waits.waits_ns)
             weighted += [(wait_ns + frames * waits.cycle_ns, share) for wait_ns in waits.waits_ns]
             if (1 - success) ** (frames + 1) < _MIN_PROBABILITY:
                 break

@@ -113,6 +113,8 @@ def bands_of(region: str, *, frequency_hz: int, bandwidth_hz: int) -> tuple[Band
 def power_limit_dbm(region: str, *, frequency_hz: int, bandwidth_hz: int, antenna_gain_dbi: float) -> float:
     """Return the limit of the power at the antenna connector, where there is one at an unlimited duty cycle.
 
+    Elsewhere :func:`duty_cycle_limit` has to be kept as well.
+
     ``antenna_gain_dbi``: less the loss of the cable. Raises RadioSettingsError for a channel outside the region.
     """
     limits_dbm = []
@@ -125,6 +127,19 @@ def power_limit_dbm(region: str, *, frequency_hz: int, bandwidth_hz: int, antenn
         else:
             limits_dbm.append(NARROW_EIRP_DBM - antenna_gain_dbi)
     return min(limits_dbm)
+
+
+def duty_cycle_limit(region: str, *, frequency_hz: int, bandwidth_hz: int) -> float | None:
+    """Return the limit of the duty cycle within any hour at the power of :func:`power_limit_dbm`; None: unlimited.
+
+    Raises RadioSettingsError for a channel outside the region.
+    """
+    limits = [
+        band.duty_cycle
+        for band in bands_of(region, frequency_hz=frequency_hz, bandwidth_hz=bandwidth_hz)
+        if band.duty_cycle is not None and band.unlimited_duty_erp_dbm is None
+    ]
+    return min(limits, default=None)
 
 
 def preset_power_dbm(

@@ -40,6 +40,8 @@ PRISM_TYPES: Final = {
 _PRISM_TYPE_NAMES: Final = {number: name for name, (number, _) in PRISM_TYPES.items()}
 _USER_TYPE: Final = 9
 _USER_PRISM_NAME: Final = "TSGT"
+_REFLECTOR_PRISM: Final = 1  # BAP_REFLTYPE; 0 is undefined
+_REFLECTOR_TAPE: Final = 2
 
 EDM_MODES: Final = {
     1: "single_tape",
@@ -201,7 +203,7 @@ async def set_up(line: GeoComConnection, config: LeicaInstrumentConfig, identity
     problems = {setting.name: await apply_setting(line, setting) for setting in settings}
     if identity.robotic is not False and identity.power_search:
         min_m, max_m = config.search_distance_m
-        await line.call(Rpc.AUT_PS_SET_RANGE, min_m, max(max_m, min_m + 10))
+        await line.call(Rpc.AUT_PS_SET_RANGE, min_m, max_m)
         await line.call(Rpc.AUT_PS_ENABLE_RANGE, 1)
     return problems
 
@@ -245,7 +247,10 @@ async def _set_reflector(
     if required_m is not None and not _has_constant(now_m, required_m):
         reply = await _write(line, Rpc.TMC_SET_PRISM_CORR, required_m)
         if not succeeded(reply):  # the TPS1200 has user-defined prisms instead
-            await _write(line, Rpc.BAP_SET_USER_PRISM_DEF, _USER_PRISM_NAME, required_m, 0, _USER_PRISM_NAME)
+            reflector = _REFLECTOR_TAPE if prism_type == "tape" else _REFLECTOR_PRISM
+            await _write(
+                line, Rpc.BAP_SET_USER_PRISM_DEF, _USER_PRISM_NAME, required_m, reflector, _USER_PRISM_NAME
+            )
             reply = await _write(line, Rpc.BAP_SET_PRISM_TYPE2, _USER_TYPE, _USER_PRISM_NAME)
         now_m = numeric_values(await line.call(Rpc.TMC_GET_PRISM_CORR), 1)
     if succeeded(reply) and (now_m is None or _has_constant(now_m, required_m)):

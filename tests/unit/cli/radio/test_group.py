@@ -279,3 +279,48 @@ def test_power_above_the_limit_of_the_region_is_rejected(tsgt: Tsgt) -> None:
     assert done.code == 1
     assert "CA915 allows" in done.err
     assert "2 dBm would be transmitted" in done.err
+
+
+LIMITED = ("radio", "ping", "--simulated", "--region", "EU868", "--bandwidth-khz", 125, "--sf", 9)
+
+
+@pytest.mark.parametrize(
+    ("frequency_mhz", "duty_cycle"),
+    [(864, 0.001), (868.3, 0.01), (869.0, 0.001), (869.525, 0.1), (865.0, 0.001)],
+)
+def test_duty_cycle_of_the_band_limits_the_count(tsgt: Tsgt, frequency_mhz: float, duty_cycle: float) -> None:
+    """With --region no radio transmits for longer than its band allows in an hour; the stricter of adjoining bands counts."""
+    airtime_ms = tsgt("radio", "airtime", *LIMITED[5:], "--payload", 34, "--json").json()["airtime_ms"]
+    most = int(duty_cycle * 3_600_000 / airtime_ms)
+    channel = (*LIMITED, "--frequency-mhz", frequency_mhz)
+    done = tsgt(*channel, "--count", most + 1)
+    assert done.code == 1
+    assert f"--count {most}" in done.err
+    if most < 100:
+        assert tsgt(*channel).code == 1
+        assert tsgt(*channel, "--count", most).code == 0
+
+
+@pytest.mark.parametrize("count", [(), ("--count", 1000)])
+def test_side_that_responds_obeys_the_duty_cycle(tsgt: Tsgt, count: tuple[object, ...]) -> None:
+    """It transmits as long as the other side; without --count for ever, and with the longest reply."""
+    done = tsgt("radio", "ping", "--answer", "--region", "EU868", "--frequency-mhz", 868.3, *count)
+    assert done.code == 1
+    assert "1 % of any hour" in done.err
+    assert "--count 48" in done.err
+
+
+def test_band_without_a_duty_cycle_allows_any_count(tsgt: Tsgt) -> None:
+    """At the power of the region."""
+    options = ("--simulated", "--region", "EU868", "--frequency-mhz", 869.85, "--sf", 12, "--count", 300)
+    assert tsgt("radio", "ping", *options).code == 0
+
+
+def test_attenuator_makes_a_channel_legal(tsgt: Tsgt) -> None:
+    """Where the least power of the radio is too much, an error says so, and the channel is not recommended again."""
+    options = ("radio", "ping", "--simulated", "--region", "EU433", "--frequency-mhz", 433.92, "--count", 1)
+    done = tsgt(*options)
+    assert done.code == 1
+    assert "EU433 allows 0.0 dBm" in done.err
+    assert "an attenuator of 2.0 dB: --antenna-gain-dbi 0.1" in done.err
+    assert tsgt(*options, "--antenna-gain-dbi", 0.1).code == 0

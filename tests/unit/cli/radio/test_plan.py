@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from statistics import fmean
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+from tsgt.cli.radio import plan as plan_command
+from tsgt.radio.from_config import planned_cycle
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from harness.files.cli import Tsgt
+
+    from tsgt.radio.planning import CycleEstimate
 
 SUPERFRAME = ("radio", "plan", "--protocol", "superframe", "--stations")
 CLASSIC = ("radio", "plan", "--protocol", "classic", "--stations")
@@ -44,6 +49,24 @@ def test_plan_as_text(tsgt: Tsgt) -> None:
     assert lines[2] == "cycle        1017 ms for 5 stations"
     assert any(line.split() == ["margin", *"12345", "6", "8"] for line in lines)
     assert sum(line.startswith("SF ") for line in lines) == 24
+
+
+@pytest.mark.parametrize(
+    ("arguments", "rows"), [((3, "--loss", 0.1), 1), ((16, "--loss", 0.9), 1 + 24), ((3, "--table"), 1 + 192)]
+)
+def test_other_settings_are_computed_where_they_are_needed(
+    tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...], rows: int
+) -> None:
+    """For the table, and for a remedy: with a high loss each takes a second of a small computer."""
+    computed: list[object] = []
+
+    def counted(*of: Any) -> CycleEstimate:
+        computed.append(of)
+        return planned_cycle(*of)
+
+    monkeypatch.setattr(plan_command, "planned_cycle", counted)
+    assert tsgt(*SUPERFRAME, *arguments).code == 0
+    assert len(computed) == rows
 
 
 @pytest.mark.slow

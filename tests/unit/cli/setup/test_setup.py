@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import replace
+from functools import partialmethod
 from typing import TYPE_CHECKING
 
+import click
 import pytest
 from harness.hardware.fake_machine import ADAPTER
 from harness.hardware.setup_system import PiToSetUp
 
 from tsgt import service
 from tsgt.cli import doctor
-from tsgt.cli.setup import group, options
+from tsgt.cli.setup import group, options, session
+from tsgt.cli.setup.options import Common
 from tsgt.config import ClientConfig, LeicaInstrumentConfig, MasterConfig, load
 from tsgt.config.radio import HardwareRadioConfig
-from tsgt.setup import Mission, encode_mission
+from tsgt.setup import Mission, WriteFile, encode_mission, hand_over_lines, key_step
 from tsgt.simulation.kernel import run_virtual
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from harness.files.cli import Outcome, Tsgt
+
+    from tsgt.cli.setup.session import Session
+    from tsgt.setup import Role
 
 KEY = hashlib.sha256(b"a key").digest()
 MISSION = encode_mission(
@@ -34,6 +42,18 @@ MISSION = encode_mission(
         preamble_symbols=8,
         sync_word=0x34,
         key=KEY,
+    )
+)
+OTHER_MISSION = encode_mission(
+    Mission(
+        region="EU868",
+        frequency_hz=869_850_000,
+        bandwidth_hz=250_000,
+        spreading_factor=9,
+        coding_rate=6,
+        preamble_symbols=8,
+        sync_word=0x34,
+        key=KEY[::-1],
     )
 )
 STATION = ("setup", "station", "--yes", "--station", 2, "--prism-type", "mini_360", "--mission", MISSION)
@@ -326,3 +346,168 @@ def test_licence_lifts_the_limits_of_the_region(tsgt: Tsgt, pi: PiToSetUp) -> No
     assert tsgt("setup", "master", "--yes", "--stations", 2).code == 0
     config = load(pi.root / "etc/tsgt/master.toml", MasterConfig)
     assert (config.radio.licence, len(config.stations)) == ("CEPT 4711", 2)
+
+
+def edit(path: Path, before: str, after: str) -> str:
+    """Edit a configuration by hand; return the new text."""
+    text = path.read_text().replace(before, after)
+    assert after in text
+    path.write_text(text)
+    return text
+
+
+def test_licence_and_power_of_another_region_are_not_kept(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """They would lift or break the law of the new country."""
+    assert tsgt(*MASTER, "--licence", "RSS 4711").code == 0
+    path = pi.root / "etc/tsgt/master.toml"
+    edit(path, "# power_dbm = 10 ", "power_dbm = 17 ")
+    again = ("setup", "master", "--yes", "--region", "EU868", "--replace-config")
+    done = tsgt(*again)
+    assert done.code == 0, done.out
+    radio = load(path, MasterConfig).radio
+    assert (radio.region, radio.licence, radio.power_dbm) == ("EU868", None, None)
+    assert 'the licence "RSS 4711" is for the former channel' in done.out
+    assert tsgt(*again, "--licence", "CEPT 1").code == 0
+    assert load(path, MasterConfig).radio.licence == "CEPT 1"
+
+
+def test_licence_of_another_mission_is_not_kept(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """A station that takes part in another mission, in another country."""
+    assert tsgt(*STATION, "--licence", "RSS 4711").code == 0
+    done = tsgt("setup", "station", "--yes", "--replace-key", "--mission", OTHER_MISSION)
+    assert done.code == 0, done.out
+    assert client(pi).radio.licence is None
+
+
+def test_constant_of_a_user_defined_prism_is_kept(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """With another prism type it goes."""
+    tsgt(*STATION)
+    path = pi.root / "etc/tsgt/client.toml"
+    edit(path, 'prism_type = "mini_360"', 'prism_type = "user"\nprism_constant_mm = 12.5')
+    for given, expected in (((), ("user", 12.5)), (("--prism-type", "360"), ("360", None))):
+        done = tsgt("setup", "station", "--yes", "--replace-config", *given)
+        assert done.code == 0, done.out
+        instrument = client(pi).instrument
+        assert isinstance(instrument, LeicaInstrumentConfig)
+        assert (instrument.prism_type, instrument.prism_constant_mm) == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (("--station", 5), "station"),
+        (("--prism", 5), "prism"),
+        (("--prism-type", "360"), "prism_type"),
+        (("--antenna-gain-dbi", 3), "antenna_gain_dbi"),
+        (("--mission", OTHER_MISSION, "--replace-key"), "frequency_mhz"),
+    ],
+)
+def test_option_that_an_edited_configuration_contradicts_fails(
+    tsgt: Tsgt, pi: PiToSetUp, options: tuple[object, ...], what: str
+) -> None:
+    """It is not in force: the configuration stays, and so does the key."""
+    tsgt(*STATION)
+    edit(pi.root / "etc/tsgt/client.toml", "search_window_deg = 40.0", "search_window_deg = 60.0")
+    before, pi.commands = pi.files(), []
+    line = failed(tsgt("setup", "station", "--yes", *options))
+    assert "configuration" in line
+    assert what in line
+    assert "--replace-config" in line
+    assert (pi.files(), pi.commands) == (before, [])
+    assert tsgt("setup", "station", "--yes", "--replace-config", *options).code == 0
+
+
+def test_option_for_a_configuration_that_setup_does_not_write_fails(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """One with another kind of instrument, for example; without options the rest of the machine is set up."""
+    tsgt(*STATION)
+    path = pi.root / "etc/tsgt/client.toml"
+    before, after = path.read_text().split("[instrument]")
+    bridge = '[instrument]\nkind = "bridge"\ncommand = ["true"]\n\n'
+    path.write_text(before + bridge + after[after.index("[radio]") :])
+    files = pi.files()
+    line = failed(tsgt("setup", "station", "--yes", "--replace-key", "--mission", OTHER_MISSION))
+    assert "--mission would not be in force" in line
+    assert pi.files() == files
+    done = tsgt("setup", "station", "--yes")
+    assert "FAILED  configuration" not in done.out
+    assert pi.files() == files
+
+
+def test_refused_configuration_leaves_the_key(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Key and channel change together: with one of them the station could talk to neither mission."""
+    tsgt(*STATION)
+    before = pi.files()
+    other = ("--mission", OTHER_MISSION, "--replace-key", "--antenna-gain-dbi", 40)
+    assert "configuration" in failed(tsgt("setup", "station", "--yes", *other))
+    assert pi.files() == before
+
+
+def test_declined_replacement_is_no_success(
+    tsgt: Tsgt, pi: PiToSetUp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was asked for is not in force."""
+    tsgt(*STATION)
+    before = pi.files()
+    monkeypatch.setattr(Common, "session", partialmethod(asking, Common.session))
+    monkeypatch.setattr(click, "prompt", lambda _text, *, default, **_: default)
+    monkeypatch.setattr(click, "confirm", lambda _text, **_: False)
+    assert "stays as it was" in failed(tsgt("setup", "station", "--prism", 4))
+    assert pi.files() == before
+
+
+def asking(common: Common, session: Callable[[Common, Role], Session], role: Role) -> Session:
+    """Begin a setup at a terminal."""
+    return replace(session(common, role), ask=True)
+
+
+def test_each_backup_of_an_edited_configuration_stays(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """A second replacement has a backup of its own."""
+    tsgt(*STATION)
+    path = pi.root / "etc/tsgt/client.toml"
+    edited = []
+    for window in ("60.0", "70.0"):
+        edited.append(edit(path, "search_window_deg = 40.0", f"search_window_deg = {window}"))
+        assert tsgt("setup", "station", "--yes", "--replace-config").code == 0
+    kept = [path.with_name(f"client.toml.before-setup{suffix}").read_text() for suffix in ("", "-2")]
+    assert kept == edited
+
+
+def test_key_gets_its_owner_and_mode_back(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """After somebody has changed them; the daemon refuses such a key."""
+    tsgt(*STATION)
+    path = pi.root / "etc/tsgt/radio.key"
+    path.chmod(0o644)
+    done = tsgt("setup", "station", "--yes")
+    assert done.code == 0, done.out
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_key_of_another_owner_is_given_back(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """To the user of the service, also where no mission is named; not in an image that another user prepares."""
+    tsgt(*STATION)
+    passwd = pi.root / "etc/passwd"
+    edit(passwd, f"tsgt:x:{os.getuid()}:", "tsgt:x:4711:")
+    for key in (KEY, None):
+        (change,) = key_step(pi.system(), key).changes
+        assert isinstance(change, WriteFile)
+        assert (change.owner, change.mode, change.text) == ("tsgt", 0o600, KEY.hex() + "\n")
+    pi.uid = 1000
+    assert not key_step(pi.system(), KEY).changes
+
+
+def test_mission_may_be_typed_in_its_groups(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Of four characters, as it is shown to read out."""
+    typed = " ".join(hand_over_lines(MISSION.lower()))
+    done = tsgt(*STATION[:-1], f" {typed}")
+    assert done.code == 0, done.out
+    assert (pi.root / "etc/tsgt/radio.key").exists()
+
+
+def test_folder_without_a_system_is_refused(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A card that is not mounted: nothing is written there."""
+    monkeypatch.setattr(options, "this_system", session.this_system)
+    done = tsgt(*MASTER, "--root", tmp_path / "rootfs")
+    assert "is the card mounted?" in failed(done)
+    assert not (tmp_path / "rootfs").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -94,6 +95,15 @@ def test_ages_without_phase_lock_match_a_frame_level_study(
     cycle = superframe(stations, loss, phase_lock=False)
     assert cycle.age_p50_ms == pytest.approx(p50_ms, rel=0.1)
     assert cycle.age_p99_ms == pytest.approx(p99_ms, rel=0.1)
+
+
+@pytest.mark.parametrize("loss", [0.7, 0.9])
+def test_age_at_a_high_loss_is_that_of_the_frames_until_a_reply(loss: float) -> None:
+    """By the geometric distribution, less what is rarer than one in 10 000; the first reply and the transport come to it."""
+    cycle, failed = superframe(3, loss, phase_lock=False), 1 - (1 - loss) ** 2
+    for quantile, age_ms in ((0.5, cycle.age_p50_ms), (0.99, cycle.age_p99_ms)):
+        frames = math.log(1 - quantile) / math.log(failed)
+        assert 0.99 * frames < age_ms / cycle.cycle_ms < frames + 1
 
 
 def test_phase_lock_halves_the_age() -> None:

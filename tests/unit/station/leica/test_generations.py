@@ -15,6 +15,7 @@ from tsgt.config import InstrumentModelConfig
 from tsgt.config.scenario import StatusFaultConfig
 from tsgt.errors import InstrumentError
 from tsgt.model import Status
+from tsgt.simulation.instrument.geocom import ForcedResponse
 from tsgt.station.geocom import ReturnCode, Rpc
 from tsgt.station.leica.reacquisition import Pointing, SearchWindow
 from tsgt.station.leica.search import TargetSearch
@@ -56,6 +57,17 @@ async def test_prism_is_tracked_lost_and_found(generation: str, code: int | None
         assert day.instrument.condition.activity == "tracking prism 1"
         assert day.station.settings.prism_constant_m == pytest.approx(0.0123)
         assert day.station.settings.edm_mode == 9
+
+
+@pytest.mark.parametrize(("prism_type", "reflector"), [("mini_360", 1), ("tape", 2)])
+async def test_own_constant_is_that_of_a_user_defined_prism(prism_type: str, reflector: int) -> None:
+    """Where no procedure sets the constant alone; the instrument is told what the reflector is: 0 is undefined."""
+    async with bench("TPS1200+", prism_type=prism_type, prism_constant_mm=12.3) as day:
+        refused = ForcedResponse(code=ReturnCode.NOT_IMPL, rpc=Rpc.TMC_SET_PRISM_CORR, times=10)
+        day.station.server.forced.append(refused)
+        await day.begin()
+        assert day.station.settings.user_reflector == reflector
+        assert day.station.settings.prism_constant_m == pytest.approx(0.0123)
 
 
 @pytest.mark.parametrize("target", ["foil", "prism"])

@@ -135,7 +135,7 @@ async def address(program: asyncio.subprocess.Process) -> str:
 async def serve(server: StreamServer, recording: Path) -> None:
     """Publish the lines of a recording at their pace, again and again, with times that go on."""
     index = index_of(recording)
-    server.publish(index.setups[0][1].strip())
+    server.publish(next(line for _, line in index.lasting if line.startswith(b'{"type":"setup"')).strip())
     start_s = time.monotonic()
     for number in count():
         played_s = number * index.length_s

@@ -28,8 +28,8 @@ from harness.readers.browser import CHROMIUM, browser
 
 from tsgt.clock import SystemClock
 from tsgt.config import ScenarioConfig
+from tsgt.recording.conditions import MAX_AGE_S, MAX_UNASKED_S
 from tsgt.simulation.demo import Demo, DemoFiles, write_demo_files
-from tsgt.web.mission.stations import MAX_AGE_S
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -197,7 +197,7 @@ def silent(line: bytes) -> bool:
         return False
     station = next(each for each in json.loads(line)["stations"] if each["id"] == 2)
     heard_s = station["last_heard_s"] or 0.0
-    return heard_s > MAX_AGE_S and (not station["answering"] or heard_s > 2 * MAX_AGE_S)
+    return heard_s > MAX_AGE_S and (not station["answering"] or heard_s > MAX_UNASKED_S)
 
 
 def event(*names: str) -> Callable[[bytes], bool]:

@@ -449,7 +449,7 @@ def test_reader_waits_for_a_place_at_a_full_relay(program: Path, tmp_path: Path)
                 line = await asyncio.wait_for(example.stdout.readline(), TIMEOUT_S)
                 assert int(line.split()[1]) == AWKWARD.stamp_ns + number * PERIOD_NS
             example.kill()
-            return (await example.stderr.read()).decode()
+            return (await example.communicate())[1].decode()
 
     problems = asyncio.run(main()).splitlines()
     assert len(problems) == 1

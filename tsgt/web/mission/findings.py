@@ -293,11 +293,6 @@ def _below(value_m: float, limit_m: float, name: str, below: set[str]) -> bool:
     return is_below
 
 
-def fence_findings(setup: SetupRecord | None, position: tuple[float, float] | None) -> list[Finding]:
-    """Return the geofences that the robot is outside of, also if it left them before this program started."""
-    return FenceMonitor().findings(setup, position)
-
-
 def unreadable_lines(name: str) -> str:
     """Return that lines of a type cannot be read: the master is newer, and this program was not restarted with it."""
     return f"{name} lines cannot be read: restart or update tsgt web"

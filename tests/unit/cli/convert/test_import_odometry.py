@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING
 
 from harness.files.cli import called
 
+from tsgt.cli.convert.cut_tables import note_cut_tables
 from tsgt.recording import read_odometry
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import pytest
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -53,3 +56,10 @@ def test_table_without_speed_is_rejected(tmp_path: Path) -> None:
     result = called("import", "odometry", table, "--output", tmp_path / "odometry.jsonl")
     assert result.code == 1
     assert "speed_mps" in result.err
+
+
+def test_empty_table_is_not_called_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It has no last line; the reader says what is wrong with it."""
+    (path := tmp_path / "empty.csv").touch()
+    note_cut_tables([path])
+    assert capsys.readouterr().err == ""

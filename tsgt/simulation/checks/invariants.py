@@ -60,8 +60,6 @@ _LINE_ROUNDING = 1e-9
 _MAX_TIMESTAMP_ERROR_NS = 40_000_000
 # The fastest response, which the configuration subtracts.
 _FASTEST_RESPONSE_NS = 20_000_000
-# An instrument that was switched off and on takes 5 s until it responds.
-_MAX_CLOCK_JUMP_NS = 1_000_000_000
 # Limit of the median over at least this number; the median of a whole mission is within 1 ms.
 _MIN_TIMESTAMPS = 40
 _MAX_MEDIAN_ERROR_NS = 5_000_000
@@ -204,7 +202,7 @@ def reading_mismatches(station_log: StationLog, journal_index: JournalIndex) -> 
             if truth in seen:
                 yield Violation("reading", f"station {station_log.station}: journalled twice: {journalled}")
             seen.add(truth)
-            if previous is None or _switched_on_between(previous, truth):
+            if previous is None or truth.switched_on_since(previous):
                 slowed_by = truth.slowed_by
             previous = truth
             stamp_ns = journal_index.true_ns(journalled)
@@ -225,12 +223,6 @@ def reading_mismatches(station_log: StationLog, journal_index: JournalIndex) -> 
             f"station {station_log.station}: median timestamp error of {len(errors_ns)} measurements "
             f"{median_ns / 1e6:.1f} ms, limit {_MAX_MEDIAN_ERROR_NS / 1e6:g} ms",
         )
-
-
-def _switched_on_between(before: ReportedDistance, after: ReportedDistance) -> bool:
-    """Whether the count of the instrument has restarted between two distances."""
-    passed_ns = (after.instrument_ms - before.instrument_ms) * 1_000_000
-    return abs(after.true_ns - before.true_ns - passed_ns) > _MAX_CLOCK_JUMP_NS
 
 
 def _timestamp_limit_ns(slowed_by: float) -> float:

@@ -47,6 +47,10 @@ FAULT_TILT_RAD: Final = 0.002
 
 POWER_SEARCH_RANGE_M: Final = (0.0, 400.0)
 
+_MAX_COUNT_JUMP_NS: Final = (
+    1_000_000_000  # an instrument that was switched off and on takes 5 s until it responds
+)
+
 REFLECTORLESS: Final = 5
 """The reflectorless EDM mode."""
 
@@ -62,6 +66,11 @@ class ReportedDistance(NamedTuple):
     prism: int | None  # None: a foil target
     code: int  # GeoCOM return code
     slowed_by: float = 1.0  # how many times slower than usual the instrument was
+
+    def switched_on_since(self, before: ReportedDistance) -> bool:
+        """Whether the count of the instrument has restarted since an earlier distance."""
+        passed_ns = (self.instrument_ms - before.instrument_ms) * 1_000_000
+        return abs(self.true_ns - before.true_ns - passed_ns) > _MAX_COUNT_JUMP_NS
 
 
 class TotalStationModel:

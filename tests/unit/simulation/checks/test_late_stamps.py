@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tsgt.simulation.checks.poses.late_stamps import LATE_S, late_stamp_tolerances
+from tsgt.simulation.instrument import ReportedDistance
 
 SPEED_MPS = 1.5
 
@@ -19,10 +20,19 @@ def _poses(at_s: np.ndarray) -> np.ndarray:
     return found
 
 
-def _index(*begins_s: int) -> Any:
+def _index(*begins_s: int, switched_on_s: int = 0) -> Any:
     """Return journals that begin at times of an instrument that is four times as slow from 60 s to 80 s."""
     reported = [
-        SimpleNamespace(true_ns=time_s * 1_000_000_000, slowed_by=4.0 if 60 <= time_s < 80 else 1.0)
+        ReportedDistance(
+            instrument_ms=1000 * (time_s - (switched_on_s if time_s >= switched_on_s else 0)),
+            true_ns=time_s * 1_000_000_000,
+            horizontal_angle_rad=0.0,
+            zenith_angle_rad=1.5,
+            distance_m=10.0,
+            prism=1,
+            code=0,
+            slowed_by=4.0 if 60 <= time_s < 80 else 1.0,
+        )
         for time_s in range(120)
     ]
     return SimpleNamespace(
@@ -45,6 +55,18 @@ def test_only_a_client_that_began_while_the_instrument_was_slow_is_late(
     found = late_stamp_tolerances(result, [_index(*begins_s)], np.array([50.0, 75.0, 100.0]))
     np.testing.assert_allclose(found[:, 0], 3.0 * LATE_S * SPEED_MPS * np.array(late), atol=1e-9)
     np.testing.assert_allclose(found[:, 1], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("switched_on_s", "late"), [(40, [0, 0, 0]), (70, [0, 1, 1]), (90, [0, 0, 0])])
+def test_instrument_that_was_switched_on_while_it_was_slow_is_late(
+    switched_on_s: int, late: list[int]
+) -> None:
+    """Nothing is known of its responses from before."""
+    prism = SimpleNamespace(position_m=(0.1, 0.2, 1.0))
+    result: Any = SimpleNamespace(parameters=SimpleNamespace(prisms=[prism]), true_poses=_poses)
+    index = _index(5, switched_on_s=switched_on_s)
+    found = late_stamp_tolerances(result, [index], np.array([50.0, 75.0, 100.0]))
+    np.testing.assert_allclose(found[:, 0], 3.0 * LATE_S * SPEED_MPS * np.array(late), atol=1e-9)
 
 
 def test_robot_that_has_slowed_down_was_measured_while_it_was_fast() -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import JournalIndex, MissionResult
 
 LATE_S = 0.03
-"""Delay of the stamps of a client that began while responses took k times as long as usual, over k - 1: 70 ms are seen where k is
+"""Delay of the stamps of a fit that began while responses took k times as long as usual, over k - 1: 70 ms are seen where k is
 four. Nothing tells the client (docs/explanation/instrument-time.md).
 """
 
@@ -64,15 +64,19 @@ def stamps_are_late(indices: Iterable[JournalIndex], at_s: float) -> bool:
 
 
 def _late_stamps(index: JournalIndex) -> Iterator[tuple[float, float, float]]:
-    """Yield begin, end and delay of the stamps of each client that began while its instrument was slower, in s."""
+    """Yield begin, end and delay of the stamps of each fit of the instrument's clock that began while it was slower, in s.
+
+    It begins with the client, and when the instrument is switched on again.
+    """
     reported = index.station_log.reported_distances
     measured_ns = [each.true_ns for each in reported]
-    begins_ns = sorted(
+    begins_ns = [
         min(times_ns)
         for measurements in index.journalled_by_start
         if (times_ns := [time for each in measurements if (time := index.true_ns(each)) is not None])
-    )
-    for from_ns, to_ns in pairwise([*begins_ns, inf]):
+    ]
+    begins_ns += [each.true_ns for before, each in pairwise(reported) if each.switched_on_since(before)]
+    for from_ns, to_ns in pairwise([*sorted(begins_ns), inf]):
         row = int(np.searchsorted(measured_ns, from_ns, side="right")) - 1
         if row >= 0 and (slowed_by := reported[row].slowed_by) > 1.0:
             yield from_ns / 1e9, to_ns / 1e9, LATE_S * (slowed_by - 1.0)

@@ -24,6 +24,8 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 START_TIMEOUT_S = 60.0
 CALL_TIMEOUT_S = 60.0
 POLL_S = 0.05
+PAGE_REPLACED = -32000
+"""Code of the protocol's error when a page is replaced by the next one while it evaluates an expression."""
 
 _OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
@@ -31,6 +33,10 @@ _OPTIONS = (
     "--disable-background-timer-throttling", "--disable-renderer-backgrounding", "--mute-audio",
     "--hide-scrollbars", "--remote-debugging-port=0", "--remote-allow-origins=*",
 )  # fmt: skip
+
+
+class PageReplacedError(Exception):
+    """The browser went to another page during a call."""
 
 
 class Tab:
@@ -57,6 +63,8 @@ class Tab:
         await self._socket.send_str(json.dumps({"id": self._calls, "method": method, "params": params}))
         async with asyncio.timeout(CALL_TIMEOUT_S):
             reply = await answer
+        if reply.get("error", {}).get("code") == PAGE_REPLACED:
+            raise PageReplacedError(reply)
         assert "error" not in reply, reply
         result: dict[str, Any] = reply["result"]
         return result
@@ -84,16 +92,21 @@ class Tab:
         return result["result"].get("value")
 
     async def wait(self, script: str, timeout_s: float) -> float:
-        """Wait until an expression is true; return how long that took, in s."""
+        """Wait until an expression is true, in this page or the next; return how long that took, in s."""
         loop = asyncio.get_running_loop()
         start_s = loop.time()
-        while not await self.run(script):
+        while not await self._is_true(script):
             text = "document.body && document.body.innerText.slice(0, 400)"
             assert loop.time() - start_s < timeout_s, (
                 f"not within {timeout_s} s: {script}: {await self.run(text)}"
             )
             await asyncio.sleep(POLL_S)
         return loop.time() - start_s
+
+    async def _is_true(self, script: str) -> bool:
+        with suppress(PageReplacedError):
+            return bool(await self.run(script))
+        return False
 
     async def screenshot(self) -> bytes:
         """Return what the window shows as a PNG."""

@@ -70,13 +70,15 @@ def _largest_sigma(matrix: Sequence[Sequence[float]]) -> float:
 
     In closed form (O. K. Smith, Eigenvalues of a symmetric 3x3 matrix, 1961), so that numpy need not be loaded.
     """
-    (a, d, e), (_, b, f), (_, _, c) = matrix
+    # Squares of absurdly large values would overflow.
+    scale = max(abs(value) for row in matrix for value in row) or 1.0
+    (a, d, e), (_, b, f), (_, _, c) = ([value / scale for value in row] for row in matrix)
     mean = (a + b + c) / 3
     spread = math.sqrt(
         ((a - mean) ** 2 + (b - mean) ** 2 + (c - mean) ** 2 + 2 * (d * d + e * e + f * f)) / 6
     )
     if spread == 0:
-        return math.sqrt(max(mean, 0.0))
+        return math.sqrt(max(mean * scale, 0.0))
     a, b, c, d, e, f = (
         (a - mean) / spread,
         (b - mean) / spread,
@@ -87,4 +89,4 @@ def _largest_sigma(matrix: Sequence[Sequence[float]]) -> float:
     )
     half_determinant = (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)) / 2
     angle = math.acos(max(-1.0, min(1.0, half_determinant))) / 3
-    return math.sqrt(max(mean + 2 * spread * math.cos(angle), 0.0))
+    return math.sqrt(max((mean + 2 * spread * math.cos(angle)) * scale, 0.0))

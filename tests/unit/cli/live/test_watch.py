@@ -119,6 +119,12 @@ def test_worst_sigmas_are_the_largest_eigenvalues(seed: int) -> None:
     assert worst_sigmas(covariance.ravel().tolist()) == pytest.approx(expected, rel=1e-9)
 
 
+def test_sigmas_of_absurdly_large_covariances_do_not_overflow() -> None:
+    """A line that a reader gets over the network may hold any numbers."""
+    covariance = np.diag([1e200, 4e200, 1e200, 1e-300, 1e-300, 9e-300])
+    assert worst_sigmas(covariance.ravel().tolist()) == pytest.approx((2e100, 3e-150), rel=1e-9)
+
+
 def test_pose_block_is_narrow() -> None:
     """For the narrowest terminal."""
     for pose in (POSE, replace(POSE, kind="smoothed", delay_s=0.5, position_m=(-123.456, -234.567, -12.345))):

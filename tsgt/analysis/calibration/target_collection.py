@@ -34,7 +34,7 @@ class TargetCollection:
         self.stations = tuple(stations)
         self.targets = tuple(targets)
         self._repeats = repeats
-        self._measurements: dict[StationTarget, list[TargetMeasurement]] = {}
+        self._measurements: list[tuple[StationTarget, TargetMeasurement]] = []  # in the order of measurement
         self._comments: list[str] = []
 
     def resume(self) -> None:
@@ -60,23 +60,27 @@ class TargetCollection:
         self._comments = comments
         if len(rest) > 1:
             file = read_partial_target_file(self.path)
-            self._measurements = {
-                (station, target): list(measurements)
+            found = [
+                ((station, target), measurement)
                 for station, targets in file.measurements.items()
                 for target, measurements in targets.items()
-            }
+                for measurement in measurements
+            ]
+            self._measurements = sorted(found, key=lambda each: each[1].line)
 
     def add(self, station: int, target: int, measurement: TargetMeasurement) -> None:
         """Add a measurement of a target; its ``line`` is ignored."""
-        self._measurements.setdefault((station, target), []).append(measurement)
+        self._measurements.append(((station, target), measurement))
 
     def remove(self, station: int, target: int) -> bool:
         """Remove the measurements of a target by a station; return whether there were any."""
-        return self._measurements.pop((station, target), None) is not None
+        before = len(self._measurements)
+        self._measurements = [each for each in self._measurements if each[0] != (station, target)]
+        return len(self._measurements) < before
 
     def count(self, station: int, target: int) -> int:
         """Return how often a station has measured a target."""
-        return len(self._measurements.get((station, target), ()))
+        return sum(pair == (station, target) for pair, _ in self._measurements)
 
     def next(self, skipped: Collection[StationTarget] = ()) -> StationTarget | None:
         """Return the next station and target to measure; None when all are complete or skipped."""
@@ -90,9 +94,14 @@ class TargetCollection:
                     yield station, target
 
     def text(self) -> str:
-        """Return the content of the file, including stations and targets beyond the requested ones."""
+        """Return the content of the file, in the order of measurement; also stations and targets beyond the requested ones."""
         return "\n".join(
-            [*self._comments, HEADER, *(_line(*key, measurement) for key, measurement in self._rows()), ""]
+            [
+                *self._comments,
+                HEADER,
+                *(_line(*pair, measurement) for pair, measurement in self._measurements),
+                "",
+            ]
         )
 
     def solution(self, station: int) -> TargetCalibration | str:
@@ -111,16 +120,11 @@ class TargetCollection:
         except (DegenerateGeometryError, InputFileError) as error:
             return str(error)
 
-    def _rows(self) -> Iterator[tuple[StationTarget, TargetMeasurement]]:
-        for key, measurements in sorted(self._measurements.items()):
-            for measurement in measurements:
-                yield key, measurement
-
     def _file(self) -> TargetFile:
         """Return what reading the file would return."""
         measurements: dict[int, dict[int, list[TargetMeasurement]]] = {}
         first_line = len(self._comments) + 2
-        for line, ((station, target), measurement) in enumerate(self._rows(), start=first_line):
+        for line, ((station, target), measurement) in enumerate(self._measurements, start=first_line):
             numbered = dataclasses.replace(measurement, line=line)
             measurements.setdefault(station, {}).setdefault(target, []).append(numbered)
         return TargetFile(self.path, measurements, ())

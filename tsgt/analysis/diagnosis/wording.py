@@ -8,6 +8,8 @@ from tsgt.geometry.motion_calibration import SetupCause
 
 CALIBRATE_MOTION = "`tsgt calibrate motion RECORDING --output frames.toml`, then `--frames frames.toml` to process and evaluate"
 
+BETWEEN_DRIVES = "Measure the targets again between drives (`tsgt calibrate check`), and restart the master with new frames if they moved."
+
 
 @dataclass(frozen=True, slots=True)
 class Wording:
@@ -59,7 +61,7 @@ WORDING: dict[SetupCause, Wording] = {
         "station {n} sinking",
         "mm",
         1e3,
-        "Set the tripod up on firm ground; process the recording in shorter parts, each with frames of its own.",
+        f"Set the tripod up on firm ground. {BETWEEN_DRIVES}",
         "measure a target before and after the drive (`tsgt calibrate check`)",
     ),
     SetupCause.TURNING: Wording(
@@ -67,7 +69,7 @@ WORDING: dict[SetupCause, Wording] = {
         "station {n} turning",
         "mrad",
         1e3,
-        "Clamp the tripod, shade it from the sun; process the recording in shorter parts, each with frames of its own.",
+        f"Clamp the tripod and shade it from the sun. {BETWEEN_DRIVES}",
         "measure a target before and after the drive (`tsgt calibrate check`)",
     ),
     SetupCause.DRIFT: Wording(
@@ -75,7 +77,7 @@ WORDING: dict[SetupCause, Wording] = {
         "station {n} drifting",
         "mm",
         1e3,
-        "Set the tripod up on firm ground; process the recording in shorter parts, each with frames of its own.",
+        f"Set the tripod up on firm ground. {BETWEEN_DRIVES}",
         "measure three targets before and after the drive (`tsgt calibrate check`)",
     ),
     SetupCause.LATENCY: Wording(
@@ -91,8 +93,8 @@ WORDING: dict[SetupCause, Wording] = {
         "vertical index of station {n}",
         "mrad",
         1e3,
-        "Set `vertical_index_mrad` of that station in the file of station frames to this value and solve the frames again "
-        "(`tsgt calibrate targets`). Adjust the instrument before the next drive.",
+        "Set `vertical_index_mrad` of that station in the file of station frames to this value, or measure the targets in both "
+        "faces (`tsgt calibrate collect --repeats 2`), from which the frames are solved with it. Adjust the instrument before the next drive.",
         "measure one target in both faces with that station",
     ),
     SetupCause.COLLIMATION: Wording(

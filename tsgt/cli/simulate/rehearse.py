@@ -66,8 +66,9 @@ def rehearse(*, auto: bool, incidents: Sequence[str], drive_s: float, seed: int,
     site = Site(folder, seed=seed, clock=clock)
     watch = Watch(site, UnixTimeline.fixed_now(clock), folder / "poses.sock")
     day = Day(site, watch, folder, None if auto else Terminal(), drive_s)
-    click.echo("In a second terminal, from which you work (and a third one for the page):", err=True)
+    click.echo("In a second terminal, from which you work, and a third one for the page:", err=True)
     click.echo(f"    cd {folder}; export TSGT_SOCKET=$PWD/poses.sock", err=True)
+    click.echo("In the third one also:", err=True)
     click.echo("    tsgt web", err=True)
 
     async def run() -> None:

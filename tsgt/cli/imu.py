@@ -14,7 +14,7 @@ baud_option = click.option(
     "--baud",
     type=click.IntRange(9_600, 921_600),
     default=115_200,
-    help="Bit rate to which the device is set.",
+    help="Bit rate that the device uses already; it is not changed.",
 )
 rate_option = click.option(
     "--rate-hz", type=click.IntRange(1, 800), default=200, help="Samples per second to be set at the device."

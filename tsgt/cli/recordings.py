@@ -87,7 +87,7 @@ def imu_options(command: Callable[..., R]) -> Callable[..., R]:
         "--imu",
         "samples",
         type=path_type,
-        help="Samples of the robot's IMU (tsgt import imu), instead of recorded ones.",
+        help="Samples of the robot's IMU (tsgt import imu), instead of the recorded ones.",
     )
     @click.option(
         "--imu-setup",
@@ -99,7 +99,7 @@ def imu_options(command: Callable[..., R]) -> Callable[..., R]:
         "--wheel-odometry",
         "wheels",
         type=path_type,
-        help="Wheel odometry (tsgt import odometry) that is used with the IMU, instead of recorded one.",
+        help="Wheel odometry (tsgt import odometry) that is used with the IMU, instead of the recorded one.",
     )
     @functools.wraps(command)
     def with_options(

@@ -134,7 +134,7 @@ class LeicaInstrumentConfig(Model):
 
 
 class BridgeInstrumentConfig(Model):
-    """An instrument read by a program of the user that prints one line per measurement; see the page bridge."""
+    """An instrument read by a user's program that prints one line per measurement; see docs/reference/bridge.md."""
 
     kind: Literal["bridge"]
     """An instrument behind a program."""

@@ -90,10 +90,10 @@ class FrameWatchConfig(Model):
     residual_mm: Positive = 6.0
     """Maximum layout residual of a stationary robot (root mean square)."""
     residual_speed_gain_ms: Annotated[float, Field(ge=0, le=1e3)] = 6.0
-    """Increase of that limit with the robot's speed."""
+    """Increase of that limit with the robot's speed, in mm per m/s."""
     window_s: Positive = 10.0
-    """The event needs three of four poses over this time above the limit; if poses have gaps, over as many poses as in a third
-    of it, from up to twelve times this time."""
+    """Window of the monitor: the event needs residuals above the limit in three quarters of its poses. If poses have gaps, the
+    window is extended up to twelvefold, until it has as many poses as a third of it would have without gaps."""
 
 
 class GeofenceConfig(Model):

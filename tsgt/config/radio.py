@@ -33,7 +33,7 @@ class ModemConfig(Model):
     power_dbm: Annotated[int, Field(ge=2, le=20)] | None = None
     """Power at the PA_BOOST pin, 2 to 17. Default: the most that the region allows with this antenna, else 2."""
     licence: Annotated[str, Field(min_length=3, max_length=200)] | None = None
-    """Number or text of a radio licence. The limits of the region do not apply with one: its own do, unchecked."""
+    """Number or text of a radio licence. With a licence the limits of the region are not applied; those of the licence are not checked."""
     allow_20_dbm: bool = False
     """Allow power_dbm = 20, which the chip supports at a duty cycle of 1 % only."""
 

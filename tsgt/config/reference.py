@@ -42,13 +42,13 @@ def _tables(
         if inner:
             within += [(each, name, each_kind) for each_kind, each in inner.items()]
             continue
-        default = "required" if key in required else f"`{_toml(field.get('default'))}`"
-        own.append(f"| `{key}` | {default} | {field['description'].replace('``', '`')} |")
+        default = "required" if key in required else _default(field.get("default"))
+        own.append(f"| `{key}` | {default} | {_cell(field['description'])} |")
     if own:
         title = ""
         if heading:
             one_of = f' with `kind = "{kind}"`' if kind else ""
-            title = f"`{heading}`{one_of} {model['description'].replace('``', '`')}\n\n"
+            title = f"`{heading}`{one_of}: {_cell(model['description'])}\n\n"
         yield "\n".join([f"\n{title}| key | default | meaning |", "|---|---|---|", *own, ""])
     for each, name, each_kind in within:
         yield from _tables(each, definitions, name, each_kind)
@@ -78,10 +78,21 @@ def _name(reference: str) -> str:
     return reference.rsplit("/", 1)[-1]
 
 
+def _cell(description: str) -> str:
+    """Return a docstring as one line."""
+    return " ".join(description.replace("``", "`").split())
+
+
+def _default(value: Any) -> str:
+    return "not set" if value is None else f"`{_toml(value)}`"
+
+
 def _toml(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_toml, value))}]"
-    return "none" if value is None else f'"{value}"' if isinstance(value, str) else str(value)
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 if __name__ == "__main__":

@@ -189,7 +189,7 @@ class OdometryConfig(Model):
     vertical_mmps: Speed = 30.0
     """One sigma of the mean velocity of the point along the z axis of the wheels over a second."""
     turning_mm: Annotated[float, Field(ge=0, le=10_000)] = 50.0
-    """One sigma by which the point may be off the one that does not slide across in a turn."""
+    """One sigma of the distance between `position_m` and the point that does not slide sideways in a turn."""
     stall_timeout_s: Positive = 2.0
     """The program is restarted if it prints no usable sample for this long."""
 

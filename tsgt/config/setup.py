@@ -75,7 +75,8 @@ class StationFrame(Model):
     """Vertical index error: the zenith angle that the instrument reads (first face) less the true one. Subtracted from
     each measurement."""
     collimation_mrad: InstrumentErrorMrad | None = None
-    """Horizontal collimation error: the line of sight deviates by it clockwise. Subtracted from each measurement."""
+    """Horizontal collimation error: the line of sight deviates by it clockwise. Corrected by adding it, divided
+    by the sine of the zenith angle, to each horizontal angle."""
     range_scale_ppm: Annotated[float, Field(ge=-1e4, le=1e4)] | None = None
     """Scale correction of the slope distance; replaces `atmospheric_ppm` of the configuration."""
 

@@ -46,9 +46,9 @@ class PolarMeasurement(FiniteNumbers):
     """Time of the measurement on the master's Unix clock in ns, converted from the host stamp, with the station's
     latency included."""
     stamp_sigma_ns: int = 0
-    """One sigma of ``stamp_ns`` in ns, without the instrument's latency: in a journal of the conversion from the
-    instrument's clock to the station's, in a recording of that to the master's clock; in what was merged from a journal
-    also the excess of the former over its usual value."""
+    """One sigma of ``stamp_ns`` in ns, without the instrument's latency. In a journal: of the conversion from the
+    instrument's clock to the station's. In a recording: of that from the station's clock to the master's. In a merged
+    measurement also the excess of the former over its usual value."""
     stamp_bound_ns: int | None = None
     """``stamp_ns`` is within this of the truth, in ns; null where unknown."""
     received_ns: int

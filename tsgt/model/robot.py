@@ -159,7 +159,7 @@ class OdometryParameters(FiniteNumbers):
     vertical_sigma_mps: float = 0.03
     """Of the mean velocity of the point along the z axis of the wheels over a second, in m/s."""
     turning_sigma_m: float = 0.05
-    """By how far the point may be off the one that does not slide across in a turn, in m; times the yaw rate it is a velocity."""
+    """Of the distance between the point and the one that does not slide sideways in a turn, in m; times the yaw rate, a velocity."""
 
     def __post_init__(self) -> None:
         """Reject impossible parameters."""

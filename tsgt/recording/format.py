@@ -30,7 +30,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingHeader:
-    """The first line of a recording, and of each further run of the master in the same file."""
+    """The first line of a recording; of several runs that were joined to one file, the first line of each."""
 
     type: Literal["recording"] = "recording"
     version: int = FORMAT_VERSION

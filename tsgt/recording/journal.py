@@ -87,7 +87,7 @@ class ReceptionRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcknowledgedRecord:
-    """How far the master has acknowledged; written now and then."""
+    """How far the master has acknowledged; written at most every 5 s."""
 
     type: Literal["acknowledged"] = "acknowledged"
     stamp_ns: int

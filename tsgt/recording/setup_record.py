@@ -50,7 +50,7 @@ class SetupStation(FiniteNumbers):
     (rad) of ``frame`` through its origin; zero for the station that defines ``frame``. Null where unknown: poses then
     take it as exact."""
     instrument: str | None = None
-    """Kind of instrument; null where unknown, as over the radio today."""
+    """Kind of instrument; null where unknown: the radio does not carry it."""
     latency_s: float
     """From a measurement to its stamp, in s, which is subtracted. Positive: the stamp is late."""
     prism: int

@@ -38,9 +38,9 @@ class Header:
         for name in self.names:
             if name not in known:
                 expected = ", ".join("|".join(alternatives) for alternatives in columns)
-                raise self.error(
-                    f"unknown column {quoted(name)}; expected {expected} and optionally {', '.join(optional)}"
-                )
+                if optional:
+                    expected += f" and optionally {', '.join(optional)}"
+                raise self.error(f"unknown column {quoted(name)}; expected {expected}")
         for alternatives in (*columns, *([name] for name in optional)):
             found = [name for name in self.names if name in alternatives]
             if len(found) > 1 or (not found and alternatives[0] not in optional):
@@ -96,6 +96,16 @@ class Row:
             raise self.error(
                 f"{column} is {quoted(text)}; expected a whole number from 0 to {MAX_INSTANT_NS}"
             )
+        return int(text)
+
+    def signed_integer(self, column: str) -> int:
+        """Parse a 64-bit integer of either sign."""
+        text = self.cells[column]
+        digits = text.removeprefix("-")
+        if not (
+            digits.isascii() and digits.isdigit() and len(digits) <= 19 and int(digits) <= MAX_INSTANT_NS
+        ):
+            raise self.error(f"{column} is {quoted(text)}; expected a whole number")
         return int(text)
 
     def seconds_ns(self, column: str) -> int:

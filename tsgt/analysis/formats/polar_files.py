@@ -74,7 +74,7 @@ def _measurement(row: Row, station: int, count: int) -> Measurement:
                 zenith_angle_rad=zenith_rad,
                 slope_distance_m=_distance_m(row),
                 status=status,
-                raw_status=_optional_integer(row, "raw_status") or 0,
+                raw_status=row.signed_integer("raw_status") if row.cells.get("raw_status") else 0,
                 host_time_ns=_optional_integer(row, "host_time_ns"),
                 instrument_time_ns=_optional_integer(row, "instrument_time_ns"),
             )

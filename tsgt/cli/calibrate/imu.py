@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     "--imu",
     "samples",
     type=path_type,
-    help="Samples of the robot's IMU (tsgt import imu), instead of recorded ones.",
+    help="Samples of the robot's IMU (tsgt import imu), instead of the recorded ones.",
 )
 @click.option(
     "--noise",
@@ -71,7 +71,7 @@ def imu(
 
     Finds mounting, position, latency and gyro matrix from two to five minutes of driving curves, slopes and bumps,
     without an initial guess. What the drive leaves undetermined is named. Exit code 3: the parts of the drive
-    contradict each other, or the measurements the samples; the file is not written.
+    contradict each other, or the prism measurements contradict the IMU samples; the file is not written.
     """
     refuse_overwrite([recording, samples], output)
     loaded = load_recording(recording, keep_going=keep_going, on_problem=report_problem)

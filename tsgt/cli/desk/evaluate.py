@@ -100,7 +100,7 @@ LISTED_OUTLIERS = 10
     "with_held_out",
     default=True,
     show_default=True,
-    help="Compute the held-out prediction error; in recordings of more than 15 min at samples.",
+    help="Compute the held-out prediction error; in recordings of more than 15 min for a sample of the measurements.",
 )
 @click.option(
     "--report",

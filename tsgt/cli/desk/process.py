@@ -61,7 +61,10 @@ FORMATS = {".tum": "tum", ".jsonl": "jsonl", ".json": "jsonl", ".csv": "csv"}
 @recording_argument
 @estimator_option
 @click.option(
-    "--rate", "rate_hz", type=FiniteRange(0.01, 1000.0), help="Poses per second.  [default: as recorded, 20]"
+    "--rate",
+    "rate_hz",
+    type=FiniteRange(0.01, 1000.0),
+    help="Poses per second.  [default: as recorded, else 20]",
 )
 @frames_option
 @prisms_option

@@ -95,7 +95,7 @@ class _Instant(click.ParamType[int]):
     default="0",
     show_default=False,
     help="Skip lines with an earlier stamp: ISO 8601 (UTC without a zone) or a stamp in ns. Lines from before the "
-    "connection are not sent again; the recording has them: tsgt replay it and listen to that.",
+    "connection are not sent again; the recording has them: replay it with tsgt replay, and listen to the replay.",
 )
 def listen(
     socket_path: Path,

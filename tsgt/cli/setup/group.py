@@ -33,7 +33,7 @@ _root_option = click.option(
 def setup() -> None:
     """Set up this machine as a station or as the master.
 
-    Both commands enable SPI, make the user of the services, find the radio, write key and configuration, start the
+    `station` and `master` enable SPI, make the user of the services, find the radio, write key and configuration, start the
     service and check everything. What is right already is left alone, so that they can be called again at any time. An
     edited configuration is kept unless --replace-config is given.
     """

@@ -31,7 +31,7 @@ polar = st.builds(
     zenith_angle_rad=st.floats(0, 2 * math.pi),
     slope_distance_m=st.none() | lengths,
     status=st.sampled_from(Status),
-    raw_status=st.integers(0, 10**4),
+    raw_status=st.integers(-(10**6), 10**6),
     host_time_ns=st.none() | instants,
     instrument_time_ns=st.none() | instants,
 )
@@ -129,6 +129,7 @@ GOOD = f"{START_NS},1,1.0,1.5,20.0,ok"
         ([HEADER, GOOD.replace(str(START_NS), "1.7e18")], "line 2: stamp_ns is '1.7e18'; expected a whole"),
         ([HEADER, GOOD.replace("20.0", "-2")], "line 2: slope_distance_m is -2; expected a distance"),
         ([HEADER, GOOD.replace("ok", "0")], "line 2: status is '0'; expected one of ok, low_accuracy"),
+        ([f"{HEADER},raw_status", f"{GOOD},1.5"], "line 2: raw_status is '1.5'; expected a whole number"),
         ([HEADER, GOOD, GOOD], "line 3: duplicate of .*line 2: station 1, prism 1, same time"),
         ([f"{HEADER},type", f"{GOOD},point"], "line 2: a point needs the columns x_m, y_m and z_m"),
         ([f"{HEADER},type", f"{GOOD},pose"], "line 2: type is 'pose'; expected measurement or point"),

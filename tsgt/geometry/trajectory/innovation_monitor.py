@@ -24,8 +24,9 @@ class InnovationMonitor:
 
     A station on a wrong prism agrees with itself, and a trajectory that is bent by a wrong measurement may happen to fit the next
     one of a single prism. ``inconsistent_prisms``: whose inconsistent measurements are not resolved yet. ``alone``: as many
-    consistent measurements in succession of one prism resolve an ambiguity without other prisms. ``followed_for_s``: time from the
-    first to the last inconsistent measurement of the newest ambiguity, once it is resolved and the trajectory has followed them.
+    consistent measurements in succession of one prism resolve an ambiguity without other prisms. ``followed_for_s``: longest time
+    from the first to the last inconsistent measurement of one prism in the newest ambiguity, once it is resolved and the trajectory
+    has followed them. One that is inconsistent by chance bends the trajectory, so that one of another prism may follow.
     After an outage the state may be ambiguous though all is consistent (:meth:`set_unproven`).
     """
 
@@ -37,9 +38,9 @@ class InnovationMonitor:
         self.inconsistent_prisms: frozenset[int] = frozenset()
         self._inconsistent_from_s = np.inf
         self._flagged = self._outliers = np.empty(0, np.bool_)
-        self._time_s = np.empty(0)
-        # First and last time of flagged inliers that have left the window since
-        self._left_s: list[float] = []
+        self._time_s, self._prism = np.empty(0), np.empty(0, np.intp)
+        # First and last time of flagged inliers that have left the window, by prism
+        self._left_s: dict[int, tuple[float, float]] = {}
         self._ambiguous_intervals_s: list[tuple[float, float]] = []
         self.followed_for_s = 0.0
 
@@ -63,7 +64,7 @@ class InnovationMonitor:
         """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
         self._flagged = self._outliers = np.zeros(len(observations), np.bool_)
-        self._time_s = observations.time_s
+        self._time_s, self._prism = observations.time_s, observations.prism
         self._consistent_prisms = frozenset()
         self._succession = 0
         self._left_s.clear()
@@ -79,19 +80,17 @@ class InnovationMonitor:
         ``needs_two_prisms``: until two prisms agree, however often one does with itself.
         """
         if not self.inconsistent_prisms:
-            self._inconsistent_from_s = time_s
+            self._inconsistent_from_s, self.followed_for_s = time_s, 0.0
         self.inconsistent_prisms |= prisms
         self._consistent_prisms, self._succession = frozenset(), 0
         self._needs_two_prisms = needs_two_prisms
 
     def select(self, rows: NDArray[np.bool_]) -> None:
         """Drop the other measurements of the window."""
-        left_s = self._time_s[self._flagged & ~self._outliers & ~rows]
-        if len(left_s):
-            times_s = [*self._left_s, *left_s.tolist()]
-            self._left_s = [min(times_s), max(times_s)]
+        left = self._flagged & ~self._outliers & ~rows
+        _extend(self._left_s, self._prism[left], self._time_s[left])
         self._flagged, self._outliers = self._flagged[rows], self._outliers[rows]
-        self._time_s = self._time_s[rows]
+        self._time_s, self._prism = self._time_s[rows], self._prism[rows]
 
     def discard_before(self, before_s: float) -> None:
         """Drop ambiguous intervals that ended long before a time."""
@@ -114,7 +113,8 @@ class InnovationMonitor:
         flagged[~is_new] = self._flagged
         # Measurements that arrive together may each pass the gate and yet be mutually inconsistent.
         flagged[is_new] = inconsistent | outliers[is_new]
-        self._flagged, self._outliers, self._time_s = flagged, outliers, observations.time_s
+        self._flagged, self._outliers = flagged, outliers
+        self._time_s, self._prism = observations.time_s, observations.prism
         rows = (
             observations.time_s[is_new].tolist(),
             observations.prism[is_new].tolist(),
@@ -149,6 +149,13 @@ class InnovationMonitor:
         if flagged.any() and not (single_prism and outliers[flagged].all()):
             times_s = observations.time_s[flagged]
             self._ambiguous_intervals_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
-            followed_s = [*followed_s, float(times_s[0]), float(times_s[-1])]
-        self.followed_for_s = max(followed_s) - min(followed_s) if followed_s else 0.0
-        self._flagged, self._left_s = np.zeros_like(flagged), []
+            _extend(followed_s, observations.prism[flagged], times_s)
+        self.followed_for_s = max([last - first for first, last in followed_s.values()], default=0.0)
+        self._flagged, self._left_s = np.zeros_like(flagged), {}
+
+
+def _extend(spans_s: dict[int, tuple[float, float]], prism: NDArray[np.intp], time_s: FloatArray) -> None:
+    """Extend first and last time by prism to those of more measurements."""
+    for each, at_s in zip(prism.tolist(), time_s.tolist(), strict=True):
+        first, last = spans_s.get(each, (at_s, at_s))
+        spans_s[each] = min(first, at_s), max(last, at_s)

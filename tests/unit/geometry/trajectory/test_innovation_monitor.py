@@ -75,12 +75,14 @@ def test_single_prism_resolves_by_its_succession(text: str, *, ambiguous: bool) 
         ("AaAbc", False, 0.0),
         ("AaAbcAbc", True, 0.0),
         ("aAbc", True, 0.0),
+        ("ABab", True, 0.0),
+        ("ABaAcb", True, 0.3),
     ],
 )
 def test_time_over_which_inconsistent_measurements_are_followed(
     text: str, for_s: float, *, followed: bool
 ) -> None:
-    """Of the newest ambiguity, once it is resolved: one alone, or some that are rejected, are none, however early after a start."""
+    """In the newest ambiguity, once it is resolved; one of each prism, or some that are rejected, are none, however early."""
     assert _monitor_after(text, followed=followed).followed_for_s == pytest.approx(for_s)
 
 
@@ -115,3 +117,11 @@ def test_measurements_after_an_outage_are_unproven(text: str, *, needs_two: bool
         monitor.select(np.zeros(len(monitor._time_s), np.bool_))
         monitor.update(_observations("abc".index(each.lower())), np.ones(1, np.bool_), wrong, wrong)
     assert bool(monitor.inconsistent_prisms) is ambiguous
+
+
+def test_ambiguity_without_inconsistent_measurements_follows_none() -> None:
+    """What was followed in an earlier one is over."""
+    monitor = _monitor_after("AaAbc", followed=True)
+    assert monitor.followed_for_s > 0.0
+    monitor.set_unproven(5.0, frozenset({0}), needs_two_prisms=True)
+    assert monitor.followed_for_s == 0.0

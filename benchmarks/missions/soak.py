@@ -69,6 +69,8 @@ FIELD_DAY_COUNT = 2
 LIMITS = (22.46, 38.26, 60.0)
 """What squared errors in sigmas, six degrees of freedom, exceed once in a thousand, in a million, in 2e10 honest poses."""
 
+COUNTERS = ("missions", "simulated_s", "cpu_s", "faults", "above", "far")
+
 
 @dataclass(frozen=True, slots=True)
 class Mission:
@@ -179,6 +181,8 @@ class Sums:
         Of these poses, how many rest on the IMU.
     above
         How many valid poses of the continuous estimator exceed each of :data:`LIMITS`, and all of them, by series.
+    far
+        How many valid poses exceed the largest of them, by seed.
     violations
         What must not happen and did: how to get it again, and what it was.
     """
@@ -193,11 +197,12 @@ class Sums:
     poses: int = 0
     with_imu: int = 0
     above: Counter[str] = field(default_factory=Counter)
+    far: Counter[str] = field(default_factory=Counter)
     violations: list[str] = field(default_factory=list)
 
     def add(self, other: Sums) -> None:
         """Add those of other missions."""
-        for name in ("missions", "simulated_s", "cpu_s", "faults", "above"):
+        for name in COUNTERS:
             getattr(self, name).update(getattr(other, name))
         self.replayed += other.replayed
         self.measurements += other.measurements
@@ -286,7 +291,7 @@ def run(
             found = [f"{each.check}: {each.detail}" for each in violations]
             if mission.passed_on:
                 found += (f"passed on: {what}" for what in passed_on.failures(done))
-            _count(done, sums)
+            _count(done, sums, str(seed))
         except (KeyboardInterrupt, SystemExit):
             raise
         except BaseException as error:  # noqa: BLE001 (whatever it is, it is a finding)
@@ -305,7 +310,7 @@ def _where(error: BaseException) -> str:
     return f"{error!r} in " + ", ".join(f"{Path(each.filename).name}:{each.lineno}" for each in calls)
 
 
-def _count(done: MissionResult, sums: Sums) -> None:
+def _count(done: MissionResult, sums: Sums, seed: str) -> None:
     sums.faults.update({str(kind): count for kind, count in done.faults.items()})
     for session in done.master_logs:
         poses = session.valid_poses()
@@ -324,6 +329,8 @@ def _count(done: MissionResult, sums: Sums) -> None:
             sums.above[f"{series}, sum"] += round(float(nees.sum()))
             for limit in LIMITS:
                 sums.above[f"{series}, above {limit:g}"] += int(np.count_nonzero(nees > limit))
+            if far := int(np.count_nonzero(nees > LIMITS[-1])):
+                sums.far[seed] += far
 
 
 def report(sums: Sums) -> None:
@@ -349,6 +356,8 @@ def report(sums: Sums) -> None:
             )
             mean = sums.above[f"{series}, sum"] / count
             print(f"  squared errors in sigmas, {series}: mean {mean:.2f} of 6; of {count} poses {shares}")
+    if sums.far:
+        print(f"  above {LIMITS[-1]:g}: " + ", ".join(f"{n} of seed {seed}" for seed, n in sums.far.items()))
     print("  " + ", ".join(f"{count} {kind}" for kind, count in sorted(sums.faults.items())))
 
 
@@ -387,9 +396,8 @@ def main() -> int:
     sums = Sums(next_seed=arguments.first)
     if arguments.json is not None and arguments.json.exists():
         kept: dict[str, Any] = json.loads(arguments.json.read_text())
-        counters = ("missions", "simulated_s", "cpu_s", "faults", "above")
         for name, value in kept.items():
-            setattr(sums, name, Counter(value) if name in counters else value)
+            setattr(sums, name, Counter(value) if name in COUNTERS else value)
     last = None if arguments.seeds is None else sums.next_seed + arguments.seeds
     seed, ends_s, told_s = sums.next_seed, time.monotonic() + 60 * arguments.minutes, time.monotonic()
     # Asked to end, it does not leave its workers behind, but waits for the missions that they are in.

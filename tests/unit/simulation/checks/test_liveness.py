@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
-from tsgt.simulation.checks.liveness import follows_another, pose_share
+from tsgt.simulation.checks.liveness import contradicted_by_station, follows_another, pose_share
 from tsgt.simulation.instrument.model import ReportedDistance
 from tsgt.simulation.mission import StationLog
 
 
 def test_poses_are_expected_unless_a_needed_imu_is_knocked_or_contradicted() -> None:
     """Three stations go on alone; fewer have nothing to go on with."""
-    assert pose_share("superframe", stations=3, knocked=True, contradicted=False) == 0.6
-    assert pose_share("superframe", stations=2, knocked=False, contradicted=False) == 0.6
+    assert pose_share("superframe", stations=3, knocked=True, contradicted=False) == 0.5
+    assert pose_share("superframe", stations=2, knocked=False, contradicted=False) == 0.5
     assert pose_share("classic", stations=1, knocked=False, contradicted=False) == 0.35
     assert pose_share("superframe", stations=2, knocked=True, contradicted=False) == 0.0
     assert pose_share("superframe", stations=2, knocked=False, contradicted=True) == 0.0
-    assert pose_share("superframe", stations=3, knocked=False, contradicted=True) == 0.6
+    assert pose_share("superframe", stations=3, knocked=False, contradicted=True) == 0.5
 
 
 @pytest.mark.parametrize(("prism", "at_s", "expected"), [(2, 12.0, True), (2, 20.0, False), (1, 12.0, False)])
@@ -24,4 +27,31 @@ def test_station_on_another_prism_is_known(prism: int, at_s: float, *, expected:
     """Its measurements contradict the IMU as those of a tripod that has moved."""
     reported = ReportedDistance(0, 10_000_000_000, 0.0, 1.5, 50.0, prism, 0)
     log = StationLog(station=1, folder=None, reported_distances=[reported])
-    assert follows_another(log, 1, at_s) is expected
+    assert follows_another(log, 1, at_s, 5.0) is expected
+
+
+@pytest.mark.parametrize(
+    ("events", "expected"),
+    [
+        ([], False),
+        ([("imu_setup_wrong", 50)], True),
+        ([("imu_setup_wrong", 70)], False),
+        ([("imu_setup_wrong", 50), ("imu_setup_confirmed", 85)], False),
+        ([("imu_setup_wrong", 50), ("imu_setup_confirmed", 95)], True),
+        ([("station_contradicted", 13)], True),
+        ([("station_contradicted", 50)], False),
+    ],
+)
+def test_event_that_a_station_on_another_prism_has_caused_is_known(
+    events: list[tuple[str, int]], *, expected: bool
+) -> None:
+    """No poses of few stations are expected from 90 s on while the set-up of the IMU is not confirmed again, or after the other event."""
+    reported = ReportedDistance(10_000, 10_000_000_000, 0.0, 1.5, 50.0, 2, 0)
+    log = StationLog(station=1, folder=None, reported_distances=[reported])
+    result: Any = SimpleNamespace(parameters=SimpleNamespace(stations=[SimpleNamespace(station=1, prism=1)]))
+    master_log: Any = SimpleNamespace(
+        unix_at_zero_ns=5,
+        events=[SimpleNamespace(event=name, stamp_ns=5 + at_s * 1_000_000_000) for name, at_s in events],
+    )
+    index: Any = SimpleNamespace(station_log=log, journalled_by_start=[])
+    assert contradicted_by_station(result, master_log, {1: index}, 90.0) is expected

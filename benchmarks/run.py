@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-SHARED = {"__init__", "endurance_subscribers", "endurance_watch", "planted_by_strangers"}
+SHARED = {"__init__", "endurance_subscribers", "endurance_watch", "independent_defects"}
 TABLE = "table"  # Runs others: it belongs to no room
 
 

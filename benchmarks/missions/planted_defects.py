@@ -8,7 +8,7 @@ missions with the faults that make it show, one seed after the other, until a ch
 nobody in the simulation is clever enough to make use of it, a test is run with the defect instead. Ends with 3 when one is
 not found.
 
-Those in `planted_by_strangers.py` run as well. `--from` takes the defects from another file, a Python module with a dictionary ``DEFECTS`` like the one below;
+Those in `independent_defects.py` run as well. `--from` takes the defects from another file, a Python module with a dictionary ``DEFECTS`` like the one below;
 docs/explanation/faults.md has an example.
 """
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 BENCHMARKS = Path(__file__).parents[1]
 TESTS = BENCHMARKS.parent / "tests"
 
-STRANGERS = Path(__file__).with_name("planted_by_strangers.py")
+INDEPENDENT = Path(__file__).with_name("independent_defects.py")
 
 SEEDS = 8
 """Missions per defect at most."""
@@ -151,12 +151,12 @@ _ERROR_STATUS = "unit/estimation/test_linear.py::test_error_status_is_the_reason
 DEFECTS: Final = {
     "no-ack": Defect("the master acknowledges nothing", defects.never_acknowledge, (F.LOSS,), duration_s=70),
     "ack-early": Defect(
-        "the master acknowledges what is not written yet",
+        "the master acknowledges measurements before they are written",
         defects.acknowledge_before_written,
         script=killed_with_a_full_disk,
     ),
     "ack-highest": Defect(
-        "the master acknowledges all up to the highest number",
+        "the master acknowledges everything up to the highest number",
         defects.acknowledge_up_to_highest,
         (F.LOSS,),
         duration_s=80,
@@ -165,17 +165,17 @@ DEFECTS: Final = {
         "a station deletes what it has sent", defects.dequeue_when_sent, (F.LOSS,), duration_s=80
     ),
     "repeats": Defect(
-        "the master hands on repeats", defects.accept_duplicates, script=killed_with_a_full_disk
+        "the master passes on duplicates", defects.accept_duplicates, script=killed_with_a_full_disk
     ),
     "repeats-classic": Defect(
-        "the master does not know repeats, classic",
+        "the master does not recognise duplicates, classic",
         defects.accept_duplicates_classic,
         (F.LOSS,),
         protocol="classic",
         duration_s=80,
     ),
     "numbers": Defect(
-        "a station begins with number 0 again",
+        "a station restarts its sequence numbers at 0",
         defects.reuse_sequence_numbers,
         (F.CLIENT_CRASH,),
         duration_s=80,
@@ -197,14 +197,14 @@ DEFECTS: Final = {
     "slot": Defect(
         "a station replies in the slot after its own", defects.reply_one_slot_late, (F.LOSS,), duration_s=80
     ),
-    "whole-ms": Defect("times are cut to whole milliseconds", defects.truncate_times_to_ms),
-    "latency": Defect("the instrument's latency is left in", defects.keep_instrument_latency),
-    "angle": Defect("angles are cut by a bit", defects.drop_lowest_angle_bit),
+    "whole-ms": Defect("times are truncated to whole milliseconds", defects.truncate_times_to_ms),
+    "latency": Defect("the instrument's latency is not subtracted", defects.keep_instrument_latency),
+    "angle": Defect("angles lose their lowest bit", defects.drop_lowest_angle_bit),
     "calibration": Defect("a station's frame is 20 mm off", defects.use_stale_station_frame),
     "calibration-continuous": Defect(
         "the same, continuous", defects.use_stale_station_frame, estimator="continuous"
     ),
-    "constant": Defect("the prism constant is left out", defects.ignore_prism_constant),
+    "constant": Defect("the prism constant is omitted", defects.ignore_prism_constant),
     "constant-continuous": Defect(
         "the same, continuous", defects.ignore_prism_constant, estimator="continuous"
     ),
@@ -215,7 +215,7 @@ DEFECTS: Final = {
         "the covariance is too small by 4", defects.quarter_covariance, estimator="continuous"
     ),
     "smoothed": Defect(
-        "smoothed poses have the time of predicted ones",
+        "smoothed poses carry the time of predicted ones",
         defects.stamp_smoothed_poses_now,
         estimator="continuous",
     ),
@@ -228,12 +228,12 @@ DEFECTS: Final = {
     ),
     "torn": Defect("half a line is not cut off", defects.keep_torn_line, (F.DISK_FULL,), duration_s=100),
     "late-5ms": Defect(
-        "one station is taken 5 ms late, continuous",
+        "`continuous` takes one station 5 ms late",
         defects_published.date_station_late(0.005),
         estimator="continuous",
     ),
     "late-20ms": Defect(
-        "one station is taken 20 ms late, continuous",
+        "`continuous` takes one station 20 ms late",
         defects_published.date_station_late(0.020),
         estimator="continuous",
     ),
@@ -348,8 +348,8 @@ def read_defects(path: Path) -> dict[str, Defect]:
 
 
 def all_defects() -> dict[str, Defect]:
-    """Return the defects of this file and those of strangers."""
-    return DEFECTS | read_defects(STRANGERS)
+    """Return the defects of this file and the independent ones."""
+    return DEFECTS | read_defects(INDEPENDENT)
 
 
 def fails(key: str, test: str) -> bool:

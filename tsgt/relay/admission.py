@@ -1,4 +1,4 @@
-"""Sans-I/O: limits on who may try to connect, so that strangers cost the relay and its readers little.
+"""Sans-I/O: limits on who may try to connect, so that clients without the key cost the relay and its readers little.
 
 A key of 256 bits cannot be guessed; the limits are for processor time, memory, file descriptors and the log.
 """

@@ -1,4 +1,4 @@
-"""Strangers at a relay that runs as a process: what they cost its readers."""
+"""Clients without the key at a relay that runs as a process: what they cost its readers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tsgt.radio.key_file import write_key
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-READER, STRANGER, EVERYWHERE = "127.0.0.1", "127.0.0.9", "0.0.0.0"  # noqa: S104 (as in the guide)
+READER, WITHOUT_KEY, EVERYWHERE = "127.0.0.1", "127.0.0.9", "0.0.0.0"  # noqa: S104 (as in the guide)
 LARGEST_RSS_KB = 80_000
 
 
@@ -70,11 +70,11 @@ def others(number: int) -> str:
 @pytest.mark.parametrize(
     ("attack", "address"),
     [
-        (connect, lambda _: STRANGER),
+        (connect, lambda _: WITHOUT_KEY),
         (connect, others),
-        (drip, lambda _: STRANGER),
+        (drip, lambda _: WITHOUT_KEY),
         (drip, others),
-        (shout, lambda _: STRANGER),
+        (shout, lambda _: WITHOUT_KEY),
     ],
     ids=["silent", "silent-many-addresses", "slow", "slow-many-addresses", "huge"],
 )

@@ -1,7 +1,7 @@
 """Planted defects by somebody who had read the user documentation only, not the checkers.
 
 As in `defects.py`, each function replaces one right function by a defective one. What a user would see is in
-`benchmarks/missions/planted_by_strangers.py`.
+`benchmarks/missions/independent_defects.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Defects planted by somebody who had read the user documentation only: thirty, each of which a user would act on.
 
-python benchmarks/run.py planted_defects --from benchmarks/missions/planted_by_strangers.py
+python benchmarks/run.py planted_defects --from benchmarks/missions/independent_defects.py
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import errno
 from typing import TYPE_CHECKING
 
-from harness.missions import defects_of_strangers as d
+from harness.missions import defects_independent as d
 
 from missions.planted_defects import Defect, silent_station
 from tsgt.simulation.faults import FaultKind as F

@@ -122,7 +122,9 @@ def said(change: str, station: int, size_m: float, rng: np.random.Generator) -> 
     }[change]
     field.displaced = {(station, 0): size_m * direction}
     network = calibrate_network(field.measure(), TARGET_NOISE)
-    solved = TargetCalibration(network, {}, SetupCovariance(components=(), matrix=()), applied=True)
+    solved = TargetCalibration(
+        network, {}, SetupCovariance(components=(), matrix=()), applied=True, atmospheric_ppm={}
+    )
     notes = [note for note in target_notes(solved) if "target 1 rejected" in note]
     if not notes:
         return ""

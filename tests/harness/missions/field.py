@@ -349,6 +349,7 @@ class Field:
     stations: dict[int, Station]
     disk: DiskStatus | None = DISK
     records: list[Any] = field(default_factory=list)
+    atmospheric_ppm: float = 0.0  # as configured, of all stations
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(11))
 
     def config(self, **changes: Any) -> MasterConfig:
@@ -364,7 +365,13 @@ class Field:
             kind="master",
             setup=SetupConfig(station_frames=self.folder / "frames", prism_layout=self.folder / "prisms"),
             stations=tuple(
-                StationConfig(station=n, prism=n, prism_constant_mm=10.0, timestamp_delay_ms=delay_ms)
+                StationConfig(
+                    station=n,
+                    prism=n,
+                    prism_constant_mm=10.0,
+                    timestamp_delay_ms=delay_ms,
+                    atmospheric_ppm=self.atmospheric_ppm,
+                )
                 for n in STATIONS
             ),
             radio=SimulatedRadioConfig(

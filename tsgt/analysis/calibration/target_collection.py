@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
     from tsgt.analysis.calibration.targets import TargetCalibration
 
-HEADER = "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm"
+_HEADER_WITHOUT_PPM = "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm"
+"""Of files of earlier versions."""
+
+HEADER = f"{_HEADER_WITHOUT_PPM},atmospheric_ppm"
 
 StationTarget = tuple[int, int]  # Numbers of a station and a target
 
@@ -52,7 +55,7 @@ class TargetCollection:
             raise InputFileError(error.strerror or str(error), path=self.path) from error
         comments = [line for line in lines if line.lstrip().startswith("#")]
         rest = [line.strip() for line in lines if line.strip() and line not in comments]
-        if rest[:1] != [HEADER]:
+        if not rest or rest[0] not in (HEADER, _HEADER_WITHOUT_PPM):
             raise InputFileError(
                 "was not written by tsgt calibrate collect; give another --output, or move it away",
                 path=self.path,
@@ -134,4 +137,5 @@ def _line(station: int, target: int, measurement: TargetMeasurement) -> str:
     # repr is the shortest form that reads back to the same bits.
     numbers = (measurement.horizontal_angle_rad, measurement.zenith_angle_rad, measurement.slope_distance_m)
     constant = "" if measurement.constant_m is None else f"{1e3 * measurement.constant_m:.6g}"
-    return ",".join([str(station), str(target), *map(repr, numbers), constant])
+    ppm = f"{measurement.atmospheric_ppm:.6g}"
+    return ",".join([str(station), str(target), *map(repr, numbers), constant, ppm])

@@ -11,7 +11,7 @@ import numpy as np
 
 from tsgt.analysis.formats import InstrumentErrors
 from tsgt.errors import DegenerateGeometryError, InputFileError
-from tsgt.geometry import check_layout, corrected_distance, measurement_covariance, polar_to_cartesian
+from tsgt.geometry import check_layout, measurement_covariance, polar_to_cartesian
 from tsgt.geometry.target_calibration import (
     CONSISTENCY,
     ERRORS,
@@ -58,6 +58,9 @@ class TargetCalibration:
     frames: dict[int, FrameCalibration]  # By number of the stations but 1
     covariance: SetupCovariance  # Of frames and instrument errors
     applied: bool  # The frames are those of the corrected readings; False: unweighted, nothing is corrected
+    atmospheric_ppm: dict[
+        int, float
+    ]  # By which the distances of each station by number were corrected, on average
 
     @property
     def checks(self) -> list[Check]:
@@ -78,7 +81,7 @@ class TargetCalibration:
         """Errors that also hold for prisms, by station; the range constant is that of the targets.
 
         A scale only where the targets show one: it replaces ``atmospheric_ppm`` of the configuration, and a scale that all
-        stations have in common deforms nothing.
+        stations have in common deforms nothing. So it contains the correction that the distances of the targets had already.
         """
         if not self.applied:
             return {}
@@ -89,11 +92,14 @@ class TargetCalibration:
             result[station] = InstrumentErrors(
                 vertical_index_rad=errors[InstrumentError.VERTICAL_INDEX].value,
                 collimation_rad=errors[InstrumentError.COLLIMATION].value,
-                range_scale_ppm=1e6 * errors[InstrumentError.RANGE_SCALE].value
+                range_scale_ppm=self._total_ppm(station, errors[InstrumentError.RANGE_SCALE].value)
                 if station in scaled
                 else None,
             )
         return result
+
+    def _total_ppm(self, station: int, scale: float) -> float:
+        return 1e6 * ((1.0 + 1e-6 * self.atmospheric_ppm[station]) * (1.0 + scale) - 1.0)
 
     def _scaled_stations(self) -> set[int]:
         """Stations for which a scale of the distances is a cause, or is not told apart from one."""
@@ -130,8 +136,12 @@ def solve_stations(
     frames, columns, covariance = station_frames(network), network.columns, network.covariance
     if not weighted:
         frames, columns, covariance = unweighted_frames(network, TARGET_NOISE)
+    ppm = {
+        station: float(np.mean([sight.atmospheric_ppm for sights in targets.values() for sight in sights]))
+        for station, targets in file.measurements.items()
+    }
     return TargetCalibration(
-        network, frames, _setup_covariance(readings.stations, columns, covariance), weighted
+        network, frames, _setup_covariance(readings.stations, columns, covariance), weighted, ppm
     )
 
 
@@ -168,16 +178,12 @@ def target_readings(
         target=np.array([names.index(target) for _, _, target, _ in rows], dtype=np.intp),
         horizontal_rad=np.array([each.horizontal_angle_rad for *_, each in rows]),
         zenith_rad=np.array([each.zenith_angle_rad for *_, each in rows]),
-        distance_m=np.array([each.slope_distance_m + _constant_m(each, constant_m) for *_, each in rows]),
+        distance_m=np.array([each.distance_m(constant_m) for *_, each in rows]),
     )
 
 
 def _station_counts(rows: Sequence[tuple[int, int, int, TargetMeasurement]]) -> Counter[int]:
     return Counter(target for target, _ in {(target, station) for _, station, target, _ in rows})
-
-
-def _constant_m(measurement: TargetMeasurement, default_m: float) -> float:
-    return default_m if measurement.constant_m is None else measurement.constant_m
 
 
 _COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z", *ERRORS)
@@ -304,13 +310,7 @@ def mean_points(
         # Both faces: the formula of face 1 yields the same point for the angles of face 2.
         h = np.array([measurement.horizontal_angle_rad for measurement in repeats])
         z = np.array([measurement.zenith_angle_rad for measurement in repeats])
-        constants = [_constant_m(measurement, constant_m) for measurement in repeats]
-        d = np.array(
-            [
-                corrected_distance(measurement.slope_distance_m, constant_m=constant, ppm=0.0)
-                for measurement, constant in zip(repeats, constants, strict=True)
-            ]
-        )
+        d = np.array([measurement.distance_m(constant_m) for measurement in repeats])
         if d.min() <= 0:
             raise InputFileError(
                 f"{what.format(name)}: with its constant the distance is {d.min():.3f} m; correct the constant",

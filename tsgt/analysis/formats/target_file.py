@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.analysis.formats.csv_table import HORIZONTAL, ZENITH, read_table
 from tsgt.errors import InputFileError, quoted
+from tsgt.geometry import corrected_distance
 from tsgt.model import MAX_COORDINATE_M
 
 if TYPE_CHECKING:
@@ -30,19 +31,26 @@ class TargetMeasurement:
     """A raw single-shot measurement of a target, in either face.
 
     The horizontal angle is clockwise, the zenith angle above pi in face 2, the distance without corrections; ``constant_m`` is
-    added to it (None: use the constant of the command line). ``line`` is the line number in the file, from 1.
+    added to it (None: use the constant of the command line), and ``atmospheric_ppm`` scales it. ``line`` is the line number in the
+    file, from 1.
     """
 
     horizontal_angle_rad: float
     zenith_angle_rad: float
     slope_distance_m: float
     constant_m: float | None = None
+    atmospheric_ppm: float = 0.0
     line: int
 
     @property
     def face(self) -> int:
         """Face of the instrument, 1 or 2."""
         return 2 if self.zenith_angle_rad % math.tau > math.pi else 1
+
+    def distance_m(self, constant_m: float) -> float:
+        """Return the corrected slope distance; ``constant_m`` where it has no constant of its own."""
+        own_m = constant_m if self.constant_m is None else self.constant_m
+        return float(corrected_distance(self.slope_distance_m, constant_m=own_m, ppm=self.atmospheric_ppm))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +99,7 @@ def read_partial_target_file(path: Path) -> TargetFile:
     skipped: list[str] = []
     is_marker_file = tuple(header.names) == MARKER_COLUMNS
     if not is_marker_file:
-        header.expect([["station"], ["target"], *_MEASUREMENT_COLUMNS], ["constant_mm"])
+        header.expect([["station"], ["target"], *_MEASUREMENT_COLUMNS], ["constant_mm", "atmospheric_ppm"])
     for row in rows:
         station = row.positive_integer("theodolite_number" if is_marker_file else "station")
         target = row.positive_integer("marker_number" if is_marker_file else "target")
@@ -160,5 +168,6 @@ def _measurement(
         zenith_angle_rad=zenith_rad,
         slope_distance_m=row.distance_m(distance),
         constant_m=row.within("constant_mm", -1e4, 1e4) / 1e3 if row.cells.get("constant_mm") else None,
+        atmospheric_ppm=row.within("atmospheric_ppm", -1e4, 1e4) if row.cells.get("atmospheric_ppm") else 0.0,
         line=row.line,
     )

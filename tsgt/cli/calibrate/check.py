@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -192,6 +193,9 @@ async def measure_again(
                     "turn the instrument to this face, whose index error and collimation are the same, and aim again"
                 )
             else:
+                # Distances that were not corrected for the air then, as in files of earlier versions, are compared uncorrected.
+                if not before[station][target][0].atmospheric_ppm:
+                    sight = replace(sight, atmospheric_ppm=0.0)
                 measured.setdefault(station, {})[target] = [sight]
     return measured
 

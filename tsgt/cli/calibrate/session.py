@@ -42,6 +42,8 @@ class TargetSession:
     ----------
     prisms
         By station: the prism that it tracks otherwise.
+    atmospheric_ppm
+        By station: the correction of its distances that the instrument does not make.
 
     Attributes
     ----------
@@ -49,9 +51,11 @@ class TargetSession:
         Stations that may be in direct mode.
     """
 
-    def __init__(self, sender: CommandSender, prisms: Mapping[int, int]) -> None:
+    def __init__(
+        self, sender: CommandSender, prisms: Mapping[int, int], atmospheric_ppm: Mapping[int, float]
+    ) -> None:
         self._sender = sender
-        self._prisms = prisms
+        self._prisms, self._atmospheric_ppm = prisms, atmospheric_ppm
         self.direct: set[int] = set()
 
     async def measure(self, station: int, *, constant_m: float) -> TargetMeasurement:
@@ -83,6 +87,7 @@ class TargetSession:
             zenith_angle_rad=response.zenith_angle_rad,
             slope_distance_m=response.slope_distance_m,
             constant_m=constant_m,
+            atmospheric_ppm=self._atmospheric_ppm[station],
             line=0,
         )
 
@@ -176,7 +181,8 @@ async def target_session(
             sender = await stack.enter_async_context(
                 superframe_command_sender(radio, clock, prisms, protocol, settings, key)
             )
-        session = TargetSession(sender, prisms)
+        ppm = {station.station: station.atmospheric_ppm for station in config.stations}
+        session = TargetSession(sender, prisms, ppm)
         try:
             yield session
         finally:

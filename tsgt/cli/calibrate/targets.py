@@ -30,6 +30,7 @@ from tsgt.cli.calibrate.frame_output import (
 )
 from tsgt.cli.options import FiniteRange, constant_m, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite
+from tsgt.config import MasterConfig, load
 from tsgt.geometry.target_calibration import InstrumentError
 
 if TYPE_CHECKING:
@@ -129,6 +130,8 @@ def targets(
     if output is not None and solved.consistent:
         _write(output, solved, comment=f"written by tsgt calibrate targets {file}{options}")
         notes += _scale_notes(output, solved)
+    if master is not None and solved.consistent:
+        notes += _uncorrected_notes(file, master, solved)
     failures = _failures(solved, command, excluded, output)
     written = _written(solved, output)
     if as_json:
@@ -163,6 +166,18 @@ def _scale_notes(output: Path, solved: TargetCalibration) -> list[str]:
         "atmospheric_ppm of the configuration"
         for station, errors in solved.instrument_errors().items()
         if errors.range_scale_ppm is not None
+    ]
+
+
+def _uncorrected_notes(file: Path, master: Path, solved: TargetCalibration) -> list[str]:
+    """Name the stations whose prism distances the master corrects for the air, where those of the targets were not."""
+    errors = solved.instrument_errors()
+    return [
+        f"station {each.station}: {master} has atmospheric_ppm = {each.atmospheric_ppm:g}, but {file} has no such correction of "
+        "its distances, so frames and poses differ in scale; add the column atmospheric_ppm, or set the instrument"
+        for each in load(master, MasterConfig).stations
+        if each.atmospheric_ppm and solved.atmospheric_ppm.get(each.station) == 0.0
+        if each.station not in errors or errors[each.station].range_scale_ppm is None
     ]
 
 

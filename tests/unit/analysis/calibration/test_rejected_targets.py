@@ -20,7 +20,9 @@ def note(direction: np.ndarray, *stations: int, size_m: float = 0.2, count: int 
     shift = size_m * np.array([[x, -y, 0], [y, x, 0], [0, 0, 1]]) @ direction
     field.displaced = {(station, 0): shift for station in stations}
     network = calibrate_network(field.measure(), TARGET_NOISE)
-    solved = TargetCalibration(network, {}, SetupCovariance(components=(), matrix=()), applied=True)
+    solved = TargetCalibration(
+        network, {}, SetupCovariance(components=(), matrix=()), applied=True, atmospheric_ppm={}
+    )
     (text,) = target_notes(solved)
     return text
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tsgt.analysis.calibration import TargetCollection
+from tsgt.analysis.calibration.target_collection import HEADER
 from tsgt.analysis.formats import TargetMeasurement
 
 if TYPE_CHECKING:
@@ -46,3 +47,14 @@ def test_order_survives_an_interruption(tmp_path: Path) -> None:
     resumed = TargetCollection(path, (1, 2), (1, 2, 3))
     resumed.resume()
     assert resumed.text() == collection.text()
+
+
+def test_file_of_an_earlier_version_is_continued(tmp_path: Path) -> None:
+    """It has no column for the correction of the air."""
+    path = tmp_path / "targets.csv"
+    path.write_text(
+        "station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,constant_mm\n1,1,0.5,1.5,20.0,0\n"
+    )
+    collection = TargetCollection(path, (1, 2), (1, 2, 3))
+    collection.resume()
+    assert collection.text().splitlines() == [HEADER, "1,1,0.5,1.5,20.0,0,0"]

@@ -109,6 +109,16 @@ def test_constant_in_the_file_overrides_the_default(tmp_path: Path) -> None:
     np.testing.assert_allclose(own.frames[2].T, common.frames[2].T, atol=1e-12)
 
 
+def test_distances_are_corrected_for_the_air_by_the_file(tmp_path: Path) -> None:
+    """As the master corrects those of the prisms: before the constant, which is not scaled."""
+    rows = [f"{row},30,{'50' if row[0] == '1' else ''}" for row in GOOD.splitlines()]
+    path = written(tmp_path, "\n".join([f"{HEADER},constant_mm,atmospheric_ppm", *rows]))
+    measured = read_target_file(path).measurements
+    first, second = measured[1][1][0], measured[2][1][0]
+    assert first.distance_m(0.0) == pytest.approx(first.slope_distance_m * (1 + 50e-6) + 0.03, abs=1e-12)
+    assert second.distance_m(0.0) == pytest.approx(second.slope_distance_m + 0.03, abs=1e-12)
+
+
 def test_comments_blank_lines_and_byte_order_mark_are_ignored(tmp_path: Path) -> None:
     """Line numbers remain those of the file."""
     path = written(tmp_path, f"\ufeff# note\n\n{HEADER}\n  # another\n{GOOD}")

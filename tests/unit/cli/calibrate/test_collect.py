@@ -424,6 +424,22 @@ async def test_check_asks_for_the_face_that_was_measured_before(tmp_path: Path) 
     assert any("target 1 of station 1 was measured in face 1 only" in text for text in script.said)
 
 
+@pytest.mark.parametrize("corrected", [True, False])
+async def test_check_compares_distances_as_they_were_collected(tmp_path: Path, *, corrected: bool) -> None:
+    """Corrected for the air by the configuration, or not, as in a file of an earlier version."""
+    path = tmp_path / "targets.csv"
+    async with aimed(tmp_path) as (field, instruments):
+        field.atmospheric_ppm = 300.0 if corrected else 0.0
+        await collected(field, Script(instruments), path)
+        field.atmospheric_ppm = 300.0
+        before = read_partial_target_file(path).measurements
+        async with session(field, Script(instruments)) as stations:
+            now = await measure_again([(1, 1)], before, stations, Script(instruments), constant_m=0.0)
+    (sight,) = now[1][1]
+    assert sight.atmospheric_ppm == before[1][1][0].atmospheric_ppm == (300.0 if corrected else 0.0)
+    assert sight.distance_m(0.0) == pytest.approx(before[1][1][0].distance_m(0.0), abs=1e-3)
+
+
 def _master_config(folder: Path) -> Path:
     config = folder / "master.toml"
     config.write_text(

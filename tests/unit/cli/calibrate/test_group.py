@@ -54,8 +54,8 @@ def falsified(markers: Path, folder: Path, station: int, target: int, extra_m: f
     return path
 
 
-def written_to(field: TargetField, folder: Path) -> Path:
-    """Write the measurements of a simulated field of targets to a file."""
+def written_to(field: TargetField, folder: Path, *, ppm: tuple[float, ...] = ()) -> Path:
+    """Write the measurements of a simulated field of targets to a file; ``ppm``: atmospheric corrections of the stations."""
     readings = field.measure()
     rows = zip(
         readings.station + 1,
@@ -66,8 +66,12 @@ def written_to(field: TargetField, folder: Path) -> Path:
         strict=True,
     )
     lines = ["station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m"]
+    lines += [",".join(map(str, row)) for row in rows]
+    if ppm:
+        columns = ["atmospheric_ppm", *(f"{ppm[station]}" for station in readings.station.tolist())]
+        lines = [f"{line},{column}" for line, column in zip(lines, columns, strict=True)]
     path = folder / "simulated.csv"
-    path.write_text("\n".join([*lines, *(",".join(map(str, row)) for row in rows)]), encoding="utf-8")
+    path.write_text("\n".join(lines), encoding="utf-8")
     return path
 
 
@@ -291,6 +295,39 @@ def test_scale_that_is_a_cause_is_written_with_a_note(tsgt: Tsgt, tmp_path: Path
     assert [stations[station].range_scale_ppm for station in (1, 3)] == [None, None]
     assert f"{output} has the scale of station 2's distances, " in done.err
     assert "ppm; it replaces atmospheric_ppm of the configuration" in done.json()["notes"][-1]
+
+
+def test_scale_that_is_a_cause_contains_the_correction_of_the_file(tsgt: Tsgt, tmp_path: Path) -> None:
+    """It replaces that of the configuration, with which the distances of the targets were corrected."""
+    field = TargetField(
+        rng=np.random.default_rng(2), errors={(1, InstrumentError.RANGE_SCALE): 1.3e-4}, far=3
+    )
+    path, output = written_to(field, tmp_path, ppm=(0.0, 30.0, 0.0)), tmp_path / "frames.toml"
+    assert tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--output", output).code == 0
+    assert load_station_calibration(output).stations[2].range_scale_ppm == pytest.approx(130, abs=15)
+
+
+@pytest.mark.parametrize(("ppm", "named"), [((), True), ((0.0, 40.0, 0.0), False)])
+def test_targets_without_the_correction_of_the_master_are_named(
+    tsgt: Tsgt, tmp_path: Path, ppm: tuple[float, ...], *, named: bool
+) -> None:
+    """Frames and poses would differ in scale: 40 ppm are 4 mm at 100 m."""
+    path = written_to(TargetField(rng=np.random.default_rng(2)), tmp_path, ppm=ppm)
+    master = tmp_path / "master.toml"
+    stations = "".join(
+        f"[[stations]]\nstation = {n}\nprism = {n}\nprism_constant_mm = 0.0\n"
+        f"atmospheric_ppm = {40.0 if n == 2 else 0.0}\n"
+        for n in (1, 2, 3)
+    )
+    master.write_text(
+        f'kind = "master"\n{stations}[setup]\nstation_frames = "frames.toml"\nprism_layout = "layout.toml"\n'
+        '[radio]\nkind = "simulated"\nair_socket = "air.sock"\nname = "master"\nfrequency_mhz = 905.0\n'
+        'spreading_factor = 9\n[protocol]\nkind = "classic"\n[stream]\nsocket = "poses.sock"\n',
+        encoding="utf-8",
+    )
+    done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--apply", master)
+    assert done.code == 0, done.err
+    assert ("station 2: " in done.err and "has atmospheric_ppm = 40" in done.err) is named
 
 
 def test_prisms_are_solved_and_written(tsgt: Tsgt, tmp_path: Path) -> None:

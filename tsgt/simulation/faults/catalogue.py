@@ -119,7 +119,7 @@ class FaultKind(StrEnum):
     OTHER_SPREADING_FACTOR = "other-spreading-factor"
     """A client's radio is configured with another spreading factor, until the operator has found it."""
     OTHER_PROTOCOL = "other-protocol"
-    """A client is configured for classic in a mission with superframe, until the operator has found it."""
+    """A client is configured for the other protocol than the mission's, until the operator has found it."""
     UNKNOWN_STATION = "unknown-station"
     """A client is configured as a station that the master does not know, until the operator has found it."""
     SAME_STATION = "same-station"

@@ -26,7 +26,7 @@ async def _mistake(mission: Mission, fault: Fault, rng: np.random.Generator) -> 
     mistakes = {
         FaultKind.WRONG_KEY: SetupMistake(key=rng.bytes(KEY_BYTES)),
         FaultKind.OTHER_SPREADING_FACTOR: SetupMistake(spreading_factor=8),
-        FaultKind.OTHER_PROTOCOL: SetupMistake(classic=True),
+        FaultKind.OTHER_PROTOCOL: SetupMistake(other_protocol=True),
         FaultKind.UNKNOWN_STATION: SetupMistake(
             station=MAX_STATION_NUMBERS["superframe" if mission.superframe else "classic"]
         ),

@@ -117,10 +117,10 @@ def client_config(
     options: SimulationOptions,
     folder: Path,
     *,
-    classic: bool = False,
+    other_protocol: bool = False,
 ) -> ClientConfig:
-    """Return a client's configuration; journal and socket are in ``folder``. ``classic``: whatever the mission's protocol is."""
-    classic = classic or isinstance(options.protocol, ClassicMasterConfig)
+    """Return a client's configuration; journal and socket are in ``folder``. ``other_protocol``: than that of the mission."""
+    classic = isinstance(options.protocol, ClassicMasterConfig) != other_protocol
     return ClientConfig(
         kind="client",
         station=entry.station,

@@ -374,7 +374,9 @@ class Mission:
 
         settings = mistake.applied_to(self._settings)
         return run_client(
-            client_config(self._scenario, entry, self._options, folder, classic=mistake.classic),
+            client_config(
+                self._scenario, entry, self._options, folder, other_protocol=mistake.other_protocol
+            ),
             settings,
             ClientDependencies(
                 instrument=self._driver(

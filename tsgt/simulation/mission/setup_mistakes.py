@@ -16,7 +16,7 @@ class SetupMistake:
     key: bytes | None = None  # None: the mission's
     spreading_factor: int | None = None  # None: the mission's
     frequency_mhz: float | None = None  # None: the mission's
-    classic: bool = False  # whether it speaks classic though the mission speaks superframe
+    other_protocol: bool = False  # whether it does not speak that of the mission
     station: int | None = None  # station number; None: its own
     prism: int | None = None  # that it tracks from the start; None: its own
     prism_constant_mm: float = 0.0  # what the instrument adds, besides the master
@@ -24,7 +24,7 @@ class SetupMistake:
     @property
     def delivers(self) -> bool:
         """Whether the master gets its measurements as those of this station, at the latest after the correction."""
-        return self.station is None and not self.classic
+        return self.station is None and not self.other_protocol
 
     def applied_to(self, settings: LoRaSettings) -> LoRaSettings:
         """Return the settings of its radio."""

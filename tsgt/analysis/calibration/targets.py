@@ -58,9 +58,7 @@ class TargetCalibration:
     frames: dict[int, FrameCalibration]  # By number of the stations but 1
     covariance: SetupCovariance  # Of frames and instrument errors
     applied: bool  # The frames are those of the corrected readings; False: unweighted, nothing is corrected
-    atmospheric_ppm: dict[
-        int, float
-    ]  # By which the distances of each station by number were corrected, on average
+    atmospheric_ppm: dict[int, float]  # Mean correction of the distances, by number of the station
 
     @property
     def checks(self) -> list[Check]:

@@ -8,7 +8,7 @@ from tsgt.geometry.motion_calibration import SetupCause
 
 CALIBRATE_MOTION = "`tsgt calibrate motion RECORDING --output frames.toml`, then `--frames frames.toml` to process and evaluate"
 
-BETWEEN_DRIVES = "Measure the targets again between drives (`tsgt calibrate check`), and restart the master with new frames if they moved."
+BETWEEN_DRIVES = "Check the targets between drives (`tsgt calibrate check`), and solve the frames again when a tripod has moved."
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,7 +69,7 @@ FIELD_DAY_COUNT = 2
 LIMITS = (22.46, 38.26, 60.0)
 """What squared errors in sigmas, six degrees of freedom, exceed once in a thousand, in a million, in 2e10 honest poses."""
 
-COUNTERS = ("missions", "simulated_s", "cpu_s", "faults", "above", "far")
+COUNTERS = ("missions", "simulated_s", "cpu_s", "faults", "above", "far", "accused")
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +183,8 @@ class Sums:
         How many valid poses of the continuous estimator exceed each of :data:`LIMITS`, and all of them, by series.
     far
         How many valid poses exceed the largest of them, by seed.
+    accused
+        How often a station was said to contradict the IMU, by seed: after a change of that, other missions need not be run again.
     violations
         What must not happen and did: how to get it again, and what it was.
     """
@@ -198,6 +200,7 @@ class Sums:
     with_imu: int = 0
     above: Counter[str] = field(default_factory=Counter)
     far: Counter[str] = field(default_factory=Counter)
+    accused: Counter[str] = field(default_factory=Counter)
     violations: list[str] = field(default_factory=list)
 
     def add(self, other: Sums) -> None:
@@ -313,6 +316,8 @@ def _where(error: BaseException) -> str:
 def _count(done: MissionResult, sums: Sums, seed: str) -> None:
     sums.faults.update({str(kind): count for kind, count in done.faults.items()})
     for session in done.master_logs:
+        if accused := sum(each.event == "station_contradicted" for each in session.events):
+            sums.accused[seed] += accused
         poses = session.valid_poses()
         sums.measurements += len(session.measurements)
         sums.poses += len(poses.stamp_ns)

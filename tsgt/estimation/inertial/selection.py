@@ -120,7 +120,8 @@ class ImuSelector:
         self._create_with = create_with
         self._setup, self._prisms = setup, prisms
         self._established = self.station_contradicted = False
-        self._was_ambiguous = False  # The trajectory with the IMU
+        # The trajectory with the IMU, since it was found
+        self._was_consistent = self._was_ambiguous = False
         self._start_prisms = 1
         self._with = create_with(self._start_prisms)
         self._waiting: list[Observations] = []  # for the window without IMU
@@ -254,6 +255,7 @@ class ImuSelector:
             elif self._with.converged:
                 self._start_prisms = 1
             self._with = self._create_with(self._start_prisms)
+            self._was_consistent = self._was_ambiguous = False
             self._quarantine_s = max(self._quarantine_s, QUARANTINE_S)
             self._usable_from_s = now_s + self._quarantine_s
         elif found == ImuUse.SILENT:
@@ -276,18 +278,20 @@ class ImuSelector:
         """Note whether measurements of one or two prisms contradicted the IMU, and are followed from then on.
 
         A wrong one among right ones is an outlier, which is not followed. One alone that is followed is within what is possible: a
-        station that has moved contradicts with the next one too.
+        station that has moved contradicts with the next one too. A trajectory that was never consistent may itself be wrong.
         """
         rejected = (
             self._prisms == 1 and found == ImuUse.DISAGREES and DISAGREES_WITH_PRISMS in self._contradiction
         )
         followed = False
-        if self._with.ambiguous:
-            self._was_ambiguous = True
-        elif self._with.converged:
+        if not self._with.converged:
+            self._was_consistent = self._was_ambiguous = False
+        elif self._with.ambiguous:
+            self._was_ambiguous = self._was_consistent
+        else:
             # One in a thousand is inconsistent by chance, and no other.
             followed = self._was_ambiguous and self._with.followed_for_s > _SIMULTANEOUS_S
-            self._was_ambiguous = False
+            self._was_consistent, self._was_ambiguous = True, False
         self.station_contradicted |= self._established and (followed or rejected)
         self._established |= self._with.converged and not self._with.ambiguous
 

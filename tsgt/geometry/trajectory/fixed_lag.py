@@ -17,7 +17,6 @@ from tsgt.geometry.trajectory.block_tridiagonal import BlockCholesky, factorise
 from tsgt.geometry.trajectory.gauss_newton import (
     MAX_ITERATIONS,
     MIN_KNOT_SPACING_S,
-    OUTLIER_THRESHOLD,
     AnchorPrior,
     NormalEquations,
     Solution,
@@ -315,7 +314,7 @@ class FixedLagSmoother(MeasurementWindow):
             factor = factorise(system.diagonal, system.off_diagonal)
         else:
             outliers = self._solve(knots, MAX_ITERATIONS)
-        self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
+        self._monitor.update(observations, is_new, sequential_nis, outliers)
         return self._converged
 
     def _solve(self, guess: States, max_iterations: int) -> NDArray[np.bool_]:

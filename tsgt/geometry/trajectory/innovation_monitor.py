@@ -6,9 +6,11 @@ measurement was accepted, later good ones look inconsistent.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+from tsgt.geometry.trajectory.gauss_newton import OUTLIER_THRESHOLD
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,6 +20,12 @@ if TYPE_CHECKING:
 
 AMBIGUITY_MARGIN_S = 1.5  # Before the first inconsistent measurement: a few of each prism
 
+NOT_BY_CHANCE_NIS = 30.0
+"""Three degrees of freedom exceed it once in 700 000, and the square of ``OUTLIER_THRESHOLD`` once in 900. With an IMU, a tripod moved
+by 10 mm gave 28 and 34 where its prism is the only one and 50 and 53 with two, one moved by 20 mm at least 114, in the missions of
+benchmarks/run.py imu_trust.
+"""
+
 
 class InnovationMonitor:
     """Tracks innovations: after an inconsistent one the state is ambiguous until two prisms are consistent in succession.
@@ -26,7 +34,8 @@ class InnovationMonitor:
     one of a single prism. ``inconsistent_prisms``: whose inconsistent measurements are not resolved yet. ``alone``: as many
     consistent measurements in succession of one prism resolve an ambiguity without other prisms. ``followed_for_s``: longest time
     from the first to the last inconsistent measurement of one prism in the newest ambiguity, once it is resolved and the trajectory
-    has followed them. One that is inconsistent by chance bends the trajectory, so that one of another prism may follow.
+    has followed them. One that is inconsistent by chance bends the trajectory, so that one of another prism may follow; and several
+    of one prism share the error of one prediction, so that one of them must be beyond :data:`NOT_BY_CHANCE_NIS`.
     After an outage the state may be ambiguous though all is consistent (:meth:`set_unproven`).
     """
 
@@ -38,9 +47,8 @@ class InnovationMonitor:
         self.inconsistent_prisms: frozenset[int] = frozenset()
         self._inconsistent_from_s = np.inf
         self._flagged = self._outliers = np.empty(0, np.bool_)
-        self._time_s, self._prism = np.empty(0), np.empty(0, np.intp)
-        # First and last time of flagged inliers that have left the window, by prism
-        self._left_s: dict[int, tuple[float, float]] = {}
+        self._time_s, self._prism, self._nis = np.empty(0), np.empty(0, np.intp), np.empty(0)
+        self._left: dict[int, _Span] = {}  # Of flagged inliers that have left the window, by prism
         self._ambiguous_intervals_s: list[tuple[float, float]] = []
         self.followed_for_s = 0.0
 
@@ -64,10 +72,14 @@ class InnovationMonitor:
         """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
         self._flagged = self._outliers = np.zeros(len(observations), np.bool_)
-        self._time_s, self._prism = observations.time_s, observations.prism
+        self._time_s, self._prism, self._nis = (
+            observations.time_s,
+            observations.prism,
+            np.zeros(len(observations)),
+        )
         self._consistent_prisms = frozenset()
         self._succession = 0
-        self._left_s.clear()
+        self._left.clear()
         self.followed_for_s = 0.0
 
     def set_start(self, time_s: float) -> None:
@@ -88,9 +100,9 @@ class InnovationMonitor:
     def select(self, rows: NDArray[np.bool_]) -> None:
         """Drop the other measurements of the window."""
         left = self._flagged & ~self._outliers & ~rows
-        _extend(self._left_s, self._prism[left], self._time_s[left])
+        self._extend_left(left)
         self._flagged, self._outliers = self._flagged[rows], self._outliers[rows]
-        self._time_s, self._prism = self._time_s[rows], self._prism[rows]
+        self._time_s, self._prism, self._nis = self._time_s[rows], self._prism[rows], self._nis[rows]
 
     def discard_before(self, before_s: float) -> None:
         """Drop ambiguous intervals that ended long before a time."""
@@ -102,19 +114,20 @@ class InnovationMonitor:
         self,
         observations: Observations,
         is_new: NDArray[np.bool_],
-        inconsistent: NDArray[np.bool_],
+        new_nis: FloatArray,
         outliers: NDArray[np.bool_],
     ) -> None:
         """Process the N new of the window's M measurements (``is_new``); ``outliers``, (M,), are of the updated trajectory.
 
-        ``inconsistent``, (N,), are the new ones whose innovation failed the gate.
+        ``new_nis``: (N,) of the new ones.
         """
-        flagged = np.zeros(len(observations), np.bool_)
-        flagged[~is_new] = self._flagged
+        flagged, nis = np.zeros(len(observations), np.bool_), np.zeros(len(observations))
+        flagged[~is_new], nis[~is_new] = self._flagged, self._nis
         # Measurements that arrive together may each pass the gate and yet be mutually inconsistent.
-        flagged[is_new] = inconsistent | outliers[is_new]
+        flagged[is_new] = (new_nis > OUTLIER_THRESHOLD**2) | outliers[is_new]
+        nis[is_new] = new_nis
         self._flagged, self._outliers = flagged, outliers
-        self._time_s, self._prism = observations.time_s, observations.prism
+        self._time_s, self._prism, self._nis = observations.time_s, observations.prism, nis
         rows = (
             observations.time_s[is_new].tolist(),
             observations.prism[is_new].tolist(),
@@ -139,23 +152,39 @@ class InnovationMonitor:
         if followed:
             self.inconsistent_prisms |= followed
             self._consistent_prisms = frozenset()
-        if not self.inconsistent_prisms and (flagged.any() or self._left_s):
-            self._resolve(observations, outliers)
+        if not self.inconsistent_prisms and (flagged.any() or self._left):
+            self._resolve()
 
-    def _resolve(self, observations: Observations, outliers: NDArray[np.bool_]) -> None:
+    def _resolve(self) -> None:
         """Record the interval of an ambiguity that has just ended, unless its flagged measurements were rejected."""
-        flagged, followed_s = self._flagged, self._left_s
-        single_prism = len(np.unique(observations.prism[flagged])) == 1
-        if flagged.any() and not (single_prism and outliers[flagged].all()):
-            times_s = observations.time_s[flagged]
+        flagged = self._flagged
+        single_prism = len(np.unique(self._prism[flagged])) == 1
+        if flagged.any() and not (single_prism and self._outliers[flagged].all()):
+            times_s = self._time_s[flagged]
             self._ambiguous_intervals_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
-            _extend(followed_s, observations.prism[flagged], times_s)
-        self.followed_for_s = max([last - first for first, last in followed_s.values()], default=0.0)
-        self._flagged, self._left_s = np.zeros_like(flagged), {}
+            self._extend_left(flagged)
+        self.followed_for_s = max(
+            (
+                each.last_s - each.first_s
+                for each in self._left.values()
+                if each.largest_nis > NOT_BY_CHANCE_NIS
+            ),
+            default=0.0,
+        )
+        self._flagged, self._left = np.zeros_like(flagged), {}
+
+    def _extend_left(self, rows: NDArray[np.bool_]) -> None:
+        found = zip(
+            self._prism[rows].tolist(), self._time_s[rows].tolist(), self._nis[rows].tolist(), strict=True
+        )
+        for prism, time_s, nis in found:
+            first_s, last_s, largest_nis = self._left.get(prism, _Span(time_s, time_s, nis))
+            self._left[prism] = _Span(min(first_s, time_s), max(last_s, time_s), max(largest_nis, nis))
 
 
-def _extend(spans_s: dict[int, tuple[float, float]], prism: NDArray[np.intp], time_s: FloatArray) -> None:
-    """Extend first and last time by prism to those of more measurements."""
-    for each, at_s in zip(prism.tolist(), time_s.tolist(), strict=True):
-        first, last = spans_s.get(each, (at_s, at_s))
-        spans_s[each] = min(first, at_s), max(last, at_s)
+class _Span(NamedTuple):
+    """First and last time of inconsistent measurements of a prism, and how far the farthest was off."""
+
+    first_s: float
+    last_s: float
+    largest_nis: float

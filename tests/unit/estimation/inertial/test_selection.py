@@ -520,6 +520,26 @@ def test_contradiction_of_one_or_two_stations_lasts(
     assert found[-1] == contradicted
 
 
+@pytest.mark.parametrize(("consistent_before", "contradicted"), [(True, True), (False, False)])
+def test_trajectory_that_was_never_consistent_contradicts_no_station(
+    *, consistent_before: bool, contradicted: bool
+) -> None:
+    """What a new start finds first may be wrong, and is bent towards the measurements."""
+    without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
+    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
+    window.setup_uncertain = window.shock = False
+    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=2)
+    selector.begin(START)
+    for number in range(20):
+        window.converged = not 4 <= number < 8
+        window.ambiguous = 4 <= number < 12 and not (consistent_before and number == 8)
+        window.followed_for_s = 0.4 if number >= 12 else 0.0
+        selector.add_samples(imu_samples(100 * number, count=100))
+        selector.take_samples()
+        selector.choose(0.5 * (number + 1))
+    assert selector.station_contradicted == contradicted
+
+
 def test_poses_of_a_contradicted_station_are_invalid(scene: Scene) -> None:
     """And say why."""
     live = checked(scene)

@@ -8,6 +8,8 @@ import pytest
 from tsgt.geometry.trajectory import Observations
 from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
 
+BY_CHANCE, NOT_BY_CHANCE = 20.0, 40.0  # NIS of inconsistent measurements
+
 
 def _observations(*prisms: int) -> Observations:
     """One measurement of each of these prisms in turn, a tenth of a second apart."""
@@ -26,20 +28,30 @@ def _observations(*prisms: int) -> Observations:
 
 
 def _monitor_after(
-    text: str, *, alone: int | None = None, followed: bool = False, window: int = 99
+    text: str,
+    *,
+    alone: int | None = None,
+    followed: bool = False,
+    window: int = 99,
+    first_nis: float = NOT_BY_CHANCE,
 ) -> InnovationMonitor:
-    """Follow measurements after a start: ``a``, ``b`` and ``c`` are consistent ones of three prisms, capitals inconsistent ones."""
+    """Follow measurements after a start: ``a``, ``b`` and ``c`` are consistent ones of three prisms, capitals inconsistent ones.
+
+    ``first_nis``: of the first inconsistent one; the others are inconsistent by what chance gives.
+    """
     monitor = InnovationMonitor(alone)
     start = [0, 1]
     prisms = [*start, *("abc".index(each.lower()) for each in text)]
     wrong = np.array([False, False, *(each.isupper() for each in text)])
+    nis = BY_CHANCE * wrong
+    nis[wrong.argmax()] *= first_nis / BY_CHANCE
     monitor.reset(_observations(*start))
     monitor.set_start(0.1)
     for row in range(len(start), len(prisms)):
         rows = slice(max(0, row + 1 - window), row + 1)
         held = _observations(*prisms[: row + 1]).select(rows)
         outliers = wrong[rows] & (not followed)
-        monitor.update(held, np.arange(len(held)) == len(held) - 1, wrong[row : row + 1], outliers)
+        monitor.update(held, np.arange(len(held)) == len(held) - 1, nis[row : row + 1], outliers)
         monitor.select(np.arange(len(held)) > len(held) - window)
     return monitor
 
@@ -86,6 +98,16 @@ def test_time_over_which_inconsistent_measurements_are_followed(
     assert _monitor_after(text, followed=followed).followed_for_s == pytest.approx(for_s)
 
 
+@pytest.mark.parametrize("window", [99, 4])
+@pytest.mark.parametrize(("first_nis", "for_s"), [(BY_CHANCE, 0.0), (NOT_BY_CHANCE, 0.2)])
+def test_measurements_inconsistent_by_chance_are_not_followed(
+    first_nis: float, for_s: float, window: int
+) -> None:
+    """Those of one prism share the error of one prediction: one of them must be beyond what chance gives."""
+    monitor = _monitor_after("AAAaaaaa", alone=5, followed=True, first_nis=first_nis, window=window)
+    assert monitor.followed_for_s == pytest.approx(for_s)
+
+
 @pytest.mark.parametrize(("followed", "for_s"), [(True, 0.2), (False, 0.0)])
 def test_followed_measurements_that_have_left_the_window_count(for_s: float, *, followed: bool) -> None:
     """A single prism resolves an ambiguity when the window has moved on."""
@@ -115,7 +137,9 @@ def test_measurements_after_an_outage_are_unproven(text: str, *, needs_two: bool
     for each in text:
         wrong = np.array([each.isupper()])
         monitor.select(np.zeros(len(monitor._time_s), np.bool_))
-        monitor.update(_observations("abc".index(each.lower())), np.ones(1, np.bool_), wrong, wrong)
+        monitor.update(
+            _observations("abc".index(each.lower())), np.ones(1, np.bool_), BY_CHANCE * wrong, wrong
+        )
     assert bool(monitor.inconsistent_prisms) is ambiguous
 
 

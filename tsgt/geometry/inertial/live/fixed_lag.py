@@ -41,7 +41,6 @@ from tsgt.geometry.rigid import log_so3
 from tsgt.geometry.trajectory.gauss_newton import (
     MAX_ITERATIONS,
     MIN_KNOT_SPACING_S,
-    OUTLIER_THRESHOLD,
     add_measurements,
     nearest_knots,
 )
@@ -464,7 +463,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._window = replace(window, knots=found.knots, factors=found.factors)
             outliers = self._accept(observations, knot_index, found.gravity, found.factor, found)
             self._converged &= found.iterations < MAX_ITERATIONS
-        self._monitor.update(observations, is_new, sequential_nis > OUTLIER_THRESHOLD**2, outliers)
+        self._monitor.update(observations, is_new, sequential_nis, outliers)
         return self._converged
 
     def _check_proven(self, new: Observations) -> None:

@@ -71,12 +71,12 @@ def imu_status_failures(result: MissionResult) -> Iterator[str]:
         different = sum(use != of_pose for use, of_pose in pairs)
         if len(pairs) >= MIN_STATUSES and different > MAX_DIFFERENT_SHARE * len(pairs):
             yield f"{different} of {len(pairs)} statuses state another use of the IMU than the pose before"
-        # While no pose is certain enough to be valid, the bias is not either.
+        # Before poses rest on the IMU and are certain enough to be valid, the bias is not known either.
         valid = np.diff([counts.valid_poses for _, counts in master_log.counts_at_status], prepend=0) > 0
         errors = [
             float(np.linalg.norm(np.array(status.gyro_bias_radps) - result.imu.truth.gyro_bias_radps[-1]))
             for status, certain in zip(statuses, valid.tolist(), strict=True)
-            if status is not None and status.gyro_bias_radps is not None and certain
+            if status is not None and status.gyro_bias_radps is not None and status.use == "used" and certain
         ]
         if len(errors) >= MIN_STATUSES and (median := float(np.median(errors))) > MAX_BIAS_ERROR_RADPS:
             yield f"gyro bias by {len(errors)} statuses: median error {median:.4f} rad/s, limit {MAX_BIAS_ERROR_RADPS:g}"

@@ -16,15 +16,16 @@ STATUSES = 12
 
 
 @pytest.mark.parametrize(
-    ("error_radps", "valid_poses", "failures"), [(0.02, 5, 1), (0.02, 0, 0), (0.005, 5, 0)]
+    ("error_radps", "use", "valid_poses", "failures"),
+    [(0.02, "used", 5, 1), (0.02, "used", 0, 0), (0.02, "unconfirmed", 5, 0), (0.005, "used", 5, 0)],
 )
-def test_stated_gyro_bias(error_radps: float, valid_poses: int, failures: int) -> None:
-    """It is wrong if it is far from the true one while there are valid poses; before, it need not be known."""
-    status = SimpleNamespace(imu=SimpleNamespace(use="used", gyro_bias_radps=(error_radps, 0.0, 0.0)))
+def test_stated_gyro_bias(error_radps: float, use: str, valid_poses: int, failures: int) -> None:
+    """It is wrong if it is far from the true one while valid poses rest on the IMU; before, it need not be known."""
+    status = SimpleNamespace(imu=SimpleNamespace(use=use, gyro_bias_radps=(error_radps, 0.0, 0.0)))
     counts = [PublishedCounts(0, 10 * n, valid_poses * n) for n in range(1, STATUSES + 1)]
     log = SimpleNamespace(
         statuses=[status] * STATUSES,
-        imu_uses_at_status=["used"] * STATUSES,
+        imu_uses_at_status=[use] * STATUSES,
         counts_at_status=[(each, each) for each in counts],
         jumps_m=array("d"),
     )

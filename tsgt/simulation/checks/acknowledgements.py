@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from tsgt.simulation.mission import JournalIndex, MissionResult
 
 ACKNOWLEDGEMENT_TIMEOUT_S = 20.0
-"""Maximum time from delivery to the journal's record of the acknowledgement. A beacon acknowledges within a second or two; the
-journal records it at most every five.
+"""Maximum time from the delivery of a measurement and of all before it to the journal's record of the acknowledgement. A beacon
+acknowledges within a second or two; the journal records it at most every five. If that beacon is lost, the cumulative acknowledgement
+follows, which waits for those before it.
 """
 
 
@@ -24,11 +25,17 @@ def missing_acknowledgements(result: MissionResult, indices: Mapping[int, Journa
     if not result.superframe:
         return
     master_log = result.master_logs[-1]
-    oldest = {number: index.oldest_queued() for number, index in indices.items()}
-    for measurement, arrived_ns in zip(master_log.measurements, master_log.arrived_ns, strict=False):
-        waited_s = result.duration_s - arrived_ns / 1e9
-        if measurement.sequence == oldest[measurement.station] and waited_s > ACKNOWLEDGEMENT_TIMEOUT_S:
+    measurements = list(zip(master_log.measurements, master_log.arrived_ns, strict=False))
+    for number, index in indices.items():
+        oldest = index.oldest_queued()
+        before_ns = {
+            measurement.sequence: arrived_ns
+            for measurement, arrived_ns in measurements
+            if oldest is not None and measurement.station == number and measurement.sequence <= oldest
+        }
+        waited_s = result.duration_s - max(before_ns.values(), default=0) / 1e9
+        if oldest in before_ns and waited_s > ACKNOWLEDGEMENT_TIMEOUT_S:
             yield (
-                f"station {measurement.station}: sequence number {measurement.sequence} unacknowledged {waited_s:.0f} s "
-                f"after its delivery, limit {ACKNOWLEDGEMENT_TIMEOUT_S:g} s"
+                f"station {number}: sequence number {oldest} unacknowledged {waited_s:.0f} s after its delivery and that of all "
+                f"before it, limit {ACKNOWLEDGEMENT_TIMEOUT_S:g} s"
             )

@@ -373,6 +373,18 @@ def test_no_poses_are_expected_of_a_backlog(tmp_path: Path) -> None:
     assert not list(missing_poses(result))
 
 
+@pytest.mark.parametrize(("older_arrived_s", "count"), [(30, 1), (50, 0)])
+def test_acknowledgement_that_waits_for_an_older_measurement(
+    tmp_path: Path, older_arrived_s: int, count: int
+) -> None:
+    """A beacon with the acknowledgement may be lost; the cumulative one comes when all before are delivered."""
+    log = _log(tmp_path, measurement(1), measurement(0))
+    log.arrived_ns = [0, older_arrived_s * SECOND]
+    result: Any = SimpleNamespace(superframe=True, master_logs=[log], duration_s=60.0)
+    index: Any = SimpleNamespace(oldest_queued=lambda: 1)
+    assert len(list(missing_acknowledgements(result, {1: index}))) == count
+
+
 @pytest.mark.parametrize(("oldest", "count"), [(0, 1), (1, 0), (None, 0)])
 def test_acknowledgement_that_was_not_journalled(tmp_path: Path, oldest: int | None, count: int) -> None:
     """The first measurement arrived at the start; a minute later it is still the oldest in the queue."""

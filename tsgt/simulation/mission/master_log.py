@@ -38,6 +38,9 @@ class ValidPoses:
     newest_age_s: NDArray[np.float64]  # (N,) age of the newest measurement
     sent_age_s: NDArray[np.float64]  # (N,) age of the pose when it was published
     with_imu: NDArray[np.bool_]  # (N,) whether it rests on the IMU
+    unconfirmed: NDArray[
+        np.bool_
+    ]  # (N,) whether the IMU's set-up is not confirmed, for which the covariance allows
     covariance: NDArray[np.float64]  # (N, 6, 6) as published
     velocity_mps: NDArray[np.float64]  # (N, 3) as published
     angular_velocity_radps: NDArray[np.float64]  # (N, 3) as published
@@ -128,6 +131,7 @@ class MasterLog:
         self._pose_station_ages_s = array("d")
         self._counts = self._counts_before_poses = PublishedCounts(0, 0, 0)
         self._pose_with_imu = array("b")
+        self._pose_unconfirmed = array("b")
         self._pose_good = array("b")
 
     def observe(self, record: object, line: bytes) -> None:
@@ -201,6 +205,7 @@ class MasterLog:
         self._pose_numbers.append(math.sqrt(sum(squares) / len(squares)) if squares else np.nan)
         self._pose_good.append(pose.quality == "good")
         self._pose_with_imu.append(pose.imu == "used")
+        self._pose_unconfirmed.append("imu_unconfirmed" in pose.degraded_by)
         self._pose_series.append(self._series.setdefault(pose.series, len(self._series)))
 
     def valid_poses(self) -> ValidPoses:
@@ -216,6 +221,7 @@ class MasterLog:
             newest_age_s=numbers[:, 8],
             sent_age_s=np.array(self._pose_sent_ages_s),
             with_imu=np.array(self._pose_with_imu, dtype=np.bool_),
+            unconfirmed=np.array(self._pose_unconfirmed, dtype=np.bool_),
             covariance=numbers[:, 9:45].reshape(-1, 6, 6),
             velocity_mps=numbers[:, 45:48],
             angular_velocity_radps=numbers[:, 48:51],

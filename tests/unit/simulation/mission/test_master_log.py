@@ -21,8 +21,9 @@ def test_predicted_poses_that_rest_on_the_imu_are_known(tmp_path: Path) -> None:
         replace(predicted, imu="unconfirmed"),
         replace(predicted, imu="used"),
         replace(predicted, imu="used", valid=False, reason="uncertain"),
-        replace(POSE, kind="smoothed", imu="used"),
+        replace(POSE, kind="smoothed", imu="used", quality="degraded", degraded_by=("imu_unconfirmed",)),
     ):
         log.observe(pose, b"")
     assert log.predicted_with_imu == 2
     assert log.valid_poses().with_imu.tolist() == [False, True, True]
+    assert log.valid_poses().unconfirmed.tolist() == [False, False, True]

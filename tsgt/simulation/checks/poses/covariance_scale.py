@@ -52,13 +52,14 @@ _LIMITS = {
 def scale_failures(master_log: MasterLog, result: MissionResult) -> Iterator[str]:
     """Yield the series of a master whose covariances are too large.
 
-    Fewer than three stations rest on the IMU, whose errors within one mission are hardly random.
+    Fewer than three stations rest on the IMU, whose errors within one mission are hardly random. While its set-up is not
+    confirmed, covariances allow for errors that it need not have.
     """
     if len(result.parameters.prisms) < MIN_PRISMS:
         return
     valid = master_log.valid_poses()
     for series in np.unique(valid.series).tolist():
-        poses = valid.select(valid.series == series)
+        poses = valid.select((valid.series == series) & ~valid.unconfirmed)
         at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
         truth = result.true_poses(at_s)
         limit = _LIMITS.get(series, MIN_SQUARE)

@@ -48,7 +48,7 @@ class InnovationMonitor:
         self._inconsistent_from_s = np.inf
         self._flagged = self._outliers = np.empty(0, np.bool_)
         self._time_s, self._prism, self._nis = np.empty(0), np.empty(0, np.intp), np.empty(0)
-        self._left: dict[int, _Span] = {}  # Of flagged inliers that have left the window, by prism
+        self._spans: dict[int, _Span] = {}  # Of flagged inliers that have left the window, by prism
         self._ambiguous_intervals_s: list[tuple[float, float]] = []
         self.followed_for_s = 0.0
 
@@ -72,14 +72,11 @@ class InnovationMonitor:
         """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
         self._flagged = self._outliers = np.zeros(len(observations), np.bool_)
-        self._time_s, self._prism, self._nis = (
-            observations.time_s,
-            observations.prism,
-            np.zeros(len(observations)),
-        )
+        self._time_s, self._prism = observations.time_s, observations.prism
+        self._nis = np.zeros(len(observations))
         self._consistent_prisms = frozenset()
         self._succession = 0
-        self._left.clear()
+        self._spans.clear()
         self.followed_for_s = 0.0
 
     def set_start(self, time_s: float) -> None:
@@ -100,7 +97,7 @@ class InnovationMonitor:
     def select(self, rows: NDArray[np.bool_]) -> None:
         """Drop the other measurements of the window."""
         left = self._flagged & ~self._outliers & ~rows
-        self._extend_left(left)
+        self._extend_spans(left)
         self._flagged, self._outliers = self._flagged[rows], self._outliers[rows]
         self._time_s, self._prism, self._nis = self._time_s[rows], self._prism[rows], self._nis[rows]
 
@@ -152,7 +149,7 @@ class InnovationMonitor:
         if followed:
             self.inconsistent_prisms |= followed
             self._consistent_prisms = frozenset()
-        if not self.inconsistent_prisms and (flagged.any() or self._left):
+        if not self.inconsistent_prisms and (flagged.any() or self._spans):
             self._resolve()
 
     def _resolve(self) -> None:
@@ -162,24 +159,24 @@ class InnovationMonitor:
         if flagged.any() and not (single_prism and self._outliers[flagged].all()):
             times_s = self._time_s[flagged]
             self._ambiguous_intervals_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
-            self._extend_left(flagged)
+            self._extend_spans(flagged)
         self.followed_for_s = max(
             (
                 each.last_s - each.first_s
-                for each in self._left.values()
+                for each in self._spans.values()
                 if each.largest_nis > NOT_BY_CHANCE_NIS
             ),
             default=0.0,
         )
-        self._flagged, self._left = np.zeros_like(flagged), {}
+        self._flagged, self._spans = np.zeros_like(flagged), {}
 
-    def _extend_left(self, rows: NDArray[np.bool_]) -> None:
+    def _extend_spans(self, rows: NDArray[np.bool_]) -> None:
         found = zip(
             self._prism[rows].tolist(), self._time_s[rows].tolist(), self._nis[rows].tolist(), strict=True
         )
         for prism, time_s, nis in found:
-            first_s, last_s, largest_nis = self._left.get(prism, _Span(time_s, time_s, nis))
-            self._left[prism] = _Span(min(first_s, time_s), max(last_s, time_s), max(largest_nis, nis))
+            first_s, last_s, largest_nis = self._spans.get(prism, _Span(time_s, time_s, nis))
+            self._spans[prism] = _Span(min(first_s, time_s), max(last_s, time_s), max(largest_nis, nis))
 
 
 class _Span(NamedTuple):

@@ -38,9 +38,7 @@ class ValidPoses:
     newest_age_s: NDArray[np.float64]  # (N,) age of the newest measurement
     sent_age_s: NDArray[np.float64]  # (N,) age of the pose when it was published
     with_imu: NDArray[np.bool_]  # (N,) whether it rests on the IMU
-    unconfirmed: NDArray[
-        np.bool_
-    ]  # (N,) whether the IMU's set-up is not confirmed, for which the covariance allows
+    unconfirmed: NDArray[np.bool_]  # (N,) whether it rests on an IMU whose set-up is not confirmed
     covariance: NDArray[np.float64]  # (N, 6, 6) as published
     velocity_mps: NDArray[np.float64]  # (N, 3) as published
     angular_velocity_radps: NDArray[np.float64]  # (N, 3) as published

@@ -259,31 +259,32 @@ def test_client_survives_repeated_kills_of_its_program(tmp_path: Path) -> None:
         stderr=subprocess.DEVNULL,
     ) as client:
         try:
-            for runs in (1, 2, 3):
+            pid = started_after(notes, 0)
+            for _ in range(3):
                 with suppress(
                     ProcessLookupError
                 ):  # its client has just ended it: it is slow on a busy machine
-                    os.kill(last_started(notes, runs), signal.SIGKILL)
-            pid = last_started(notes, 4)
+                    os.kill(pid, signal.SIGKILL)
+                pid = started_after(notes, pid)
         finally:
             client.terminate()
         assert client.wait(TIMEOUT_S) == 0
     assert gone(pid)
     (path,) = (tmp_path / "journals").iterdir()
     journalled = [measurement.instrument_time_ns for measurement in load_journal(path).measurements]
-    # What the fourth run printed while the client was ending may not have been read.
+    # What the last run printed while the client was ending may not have been read.
     _, *noted_by_run = (run.splitlines() for run in notes.read_text().split("start "))
-    noted = [int(at_ns) for _, *run in noted_by_run[:3] for at_ns in run]
+    noted = [int(at_ns) for _, *run in noted_by_run[:-1] for at_ns in run]
     assert len(noted) >= 3 * ENOUGH
     assert len(set(journalled)) == len(journalled)
     assert set(noted) <= set(journalled)
 
 
-def last_started(notes: Path, runs: int) -> int:
-    """Wait until the program has started and measured often enough; return its process."""
+def started_after(notes: Path, pid: int) -> int:
+    """Wait until a program other than this process has started and measured often enough; return its process."""
     for _ in range(6000):
-        *_, last = ["", *notes.read_text().split("start ")]
-        if notes.read_text().count("start") == runs and last.count("\n") > ENOUGH:
-            return int(last.splitlines()[0])
+        last = notes.read_text().rpartition("start ")[2]
+        if last.count("\n") > ENOUGH and (started := int(last.splitlines()[0])) != pid:
+            return started
         time.sleep(0.01)
     raise AssertionError("the program was not started again")

@@ -79,9 +79,13 @@ class InnovationMonitor:
         self._spans.clear()
         self.followed_for_s = 0.0
 
-    def set_start(self, time_s: float) -> None:
-        """Start the ambiguity after the measurements of the initialised trajectory."""
+    def set_start(self, time_s: float, *, needs_two_prisms: bool = False) -> None:
+        """Start the ambiguity of an initialised trajectory: after its measurements or, if they prove nothing, before them.
+
+        ``needs_two_prisms``: until two prisms agree, however often one does with itself.
+        """
         self._inconsistent_from_s = time_s
+        self._needs_two_prisms |= needs_two_prisms
 
     def set_unproven(self, time_s: float, prisms: frozenset[int], *, needs_two_prisms: bool) -> None:
         """Mark the state as ambiguous from a measurement on that a wrong prism could have given as well.

@@ -31,9 +31,9 @@ UNTIL_S = 7.0
 
 
 def measurements(stations: int = 3) -> Observations:
-    """Return measurements with the layout from the centroid."""
+    """Return measurements with the layout of the prisms that the stations track, from the centroid of all."""
     observations = DRIVE.measure(stations=stations)
-    return replace(observations, layout=observations.layout - CENTROID)
+    return replace(observations, layout=observations.layout[:stations] - CENTROID)
 
 
 class Live:
@@ -265,6 +265,24 @@ def test_measurement_after_an_outage_is_confirmed_by_another_prism(stations: int
         assert live.window.ambiguous
     row = int(np.flatnonzero((observations.prism == 1) & (np.arange(len(observations)) > first[-1]))[0])
     live.measure(observations.select(slice(row, row + 1)))
+    assert live.window.converged
+    assert not live.window.ambiguous
+
+
+@pytest.mark.slow
+def test_start_from_one_of_two_prisms_is_confirmed_by_the_other() -> None:
+    """It may be the wrong one, however often it agrees with itself; until then no smoothed pose is reliable either."""
+    observations = measurements(2)
+    alone = np.flatnonzero((observations.station == 0) & (observations.time_s < UNTIL_S))
+    live = Live()
+    for row in alone:
+        live.measure(observations.select(slice(row, row + 1)))
+    assert live.window.converged
+    assert live.window.ambiguous
+    assert live.window.observations is not None
+    assert live.window.ambiguous_from_s < live.window.observations.time_s[0]
+    later = np.flatnonzero((observations.station == 1) & (observations.time_s > UNTIL_S))
+    live.measure(observations.select(later[:2]))
     assert live.window.converged
     assert not live.window.ambiguous
 

@@ -355,7 +355,12 @@ class InertialFixedLagSmoother(MeasurementWindow):
             if first > 0:
                 self._eliminate(searched, found.knot_index, first, ~held)
             self.residuals_m = self.residuals_m[-len(observations) :]
-            self._monitor.set_start(float(observations.time_s[-1]))
+            counts = np.bincount(observations.prism[~outliers])
+            # A wrong prism that is measured alone agrees with itself.
+            unproven = len(observations.layout) > 1 and int(np.count_nonzero(counts > 1)) < 2
+            self._monitor.set_start(
+                float(observations.time_s[0 if unproven else -1]), needs_two_prisms=unproven
+            )
             self._search.restart()
             self._reliable_from_s = _measured_twice_s(observations.select(~outliers))
         else:

@@ -190,6 +190,8 @@ class _Reader(asyncio.Protocol):
         return len(self._queue) >= self._queue_lines
 
     def send(self, data: bytes) -> None:
+        if self._transport.is_closing():
+            return  # it has just gone: asyncio would log each further write
         if not self._paused:
             self._transport.write(data)
             return

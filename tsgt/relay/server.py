@@ -263,7 +263,7 @@ class _Connection(asyncio.Protocol):
             if data:
                 self._tls.send(data)
             data = self._tls.outgoing()
-        if data:
+        if data and not self._transport.is_closing():  # asyncio logs writes to a reader that has gone
             self._transport.write(data)
 
     def _too_slow(self) -> None:

@@ -273,6 +273,21 @@ async def test_abrupt_disconnect_does_not_affect_others(path: Path) -> None:
         await client.close()
 
 
+async def test_many_lines_to_a_reader_that_has_gone_log_nothing(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Poses are published in bursts, before the event loop knows of the disconnection."""
+    async with StreamServer(path, HELLO) as server:
+        gone = SleepyClient(path)
+        await settle()
+        gone.socket.close()
+        for number in range(20):
+            server.publish(line(number))
+        await settle()
+        assert server.readers == 0
+    assert not caplog.records
+
+
 async def test_half_closed_reader_gets_lines(path: Path) -> None:
     """A reader that has closed its sending side still reads."""
     async with StreamServer(path, HELLO) as server:

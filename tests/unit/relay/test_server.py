@@ -243,6 +243,21 @@ def test_cut_connection_is_resumed() -> None:
     asyncio.run(main())
 
 
+def test_many_lines_to_a_cut_connection_log_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """Poses are sent in bursts, before the event loop knows of the disconnection."""
+
+    async def main() -> None:
+        async with relay() as server, AsyncStream(f"relay://{LOOPBACK}:{server.port}", key=KEY) as stream:
+            await asyncio.wait_for(taken(stream, 2), 5)
+            for reader in list(server.readers):
+                reader.abort()
+            for number in range(20):
+                server.line(pose_line(number))
+
+    asyncio.run(main())
+    assert not [record for record in caplog.records if record.name == "asyncio"]
+
+
 def test_long_resumption_overflows_no_queue() -> None:
     """The lines of some minutes arrive within a moment."""
     count = 4000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from tsgt.analysis.imu_setup import wrong_imu_setup
 from tsgt.analysis.inertial_smoothing import fit_with_imu
+from tsgt.analysis.pose_series import PoseSeries
 from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.validation import (
     check_any_measured,
@@ -21,14 +21,10 @@ from tsgt.analysis.validation import (
 )
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.estimation import (
-    ContinuousPoseOutput,
-    MeasurementHistory,
     PoseBatch,
     build_observations,
-    measured_at_ns,
     noise_scales,
     setup_jacobian,
-    usable,
     with_setup,
 )
 from tsgt.geometry import check_layout
@@ -40,28 +36,22 @@ from tsgt.geometry.batch import (
     with_noise_floor,
 )
 from tsgt.geometry.rest import find_rest
-from tsgt.geometry.trajectory import POSE_DIM
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from tsgt.analysis.inertial_smoothing import ImuUse
     from tsgt.analysis.refinement import Refine
     from tsgt.geometry import FloatArray
-    from tsgt.geometry.batch import TrajectoryFit, TrajectoryPiece
+    from tsgt.geometry.batch import TrajectoryFit
     from tsgt.geometry.inertial import InertialFit
     from tsgt.geometry.motion_calibration import RefinedSetup
     from tsgt.geometry.rest import RestInterval
-    from tsgt.geometry.trajectory import Observations, Trajectory
+    from tsgt.geometry.trajectory import Observations
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
-
-# Bounds the memory of intermediate results, which should fit into the CPU cache.
-_EPOCHS_PER_CHUNK = 1024
 
 TWO_PRISMS = 2  # Measured for a minute they tell what a single prism does not: the rotation of the IMU, but about their line
 
@@ -145,6 +135,22 @@ def smooth_recording(
     return SmoothedRecording(**fields, fit=fit, origin_ns=series.origin_ns)
 
 
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """What a trajectory is fitted to: measurements, set-up and motion model."""
+
+    recording: Recording
+    path: Path
+    measurements: Sequence[Measurement]
+    complete: bool  # All prisms of a robot with three were measured, so that no IMU is needed
+    origin_ns: int
+    parameters: Parameters  # With the set-up that is used
+    observations: Observations
+    sources: list[Measurement]
+    motion: MotionModel
+    refined: RefinedSetup | None
+
+
 def _smoothed(
     recording: Recording,
     *,
@@ -152,64 +158,16 @@ def _smoothed(
     refine: Refine,
     on_progress: Callable[[float], None] | None,
     whole: bool,
-) -> tuple[SmoothedPoses, _PoseSeries, TrajectoryFit | InertialFit | None]:
+) -> tuple[SmoothedPoses, PoseSeries, TrajectoryFit | InertialFit | None]:
     """Return the poses, and the trajectory if the ``whole`` of it is to be kept, or an IMU was used."""
-    parameters = recording.parameters
-    measurements = plausible_measurements(recording)
-    with_imu = parameters.imu is not None and bool(recording.imu_samples)
-    complete = len(measured_prisms(parameters, measurements)) == len(parameters.prisms) >= MIN_PRISMS
-    names = [prism.prism for prism in parameters.prisms]
-    alone = complete or not with_imu
-    check_layout([prism.position_m for prism in parameters.prisms], names=names, imu=not alone)
-    if alone:
-        check_prisms_measured(parameters, measurements, path)
-    else:
-        check_any_measured(parameters, measurements, path)
-    check_time_span(parameters, measurements, path)
-    origin_ns = min(m.stamp_ns for m in measurements)
-    observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
-    recorded = noise_scales(parameters)
-    if complete:
-        motion = estimate_motion_model(observations, parameters.pipeline, recorded=recorded)
-    else:
-        motion = recorded_motion_model(observations, parameters.pipeline, recorded)
-    refined = None
-    if motion.tuned:
-        refined = refine_recorded_setup(parameters, observations, motion.prior, motion.noise_scales, refine)
-    if refined is not None and refined.used:
-        parameters = with_setup(parameters, refined.parameters, refined.setup, refined.covariance)
-        observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
-        motion = estimate_motion_model(observations, parameters.pipeline, start=refined.motion_prior)
-    imu, problem = None, ""
-    if parameters.imu is not None and not recording.imu_samples:
-        problem = "the recording has no IMU samples; give --imu, a file of tsgt import imu, or --no-imu"
-    if with_imu and (complete or len(parameters.prisms) == TWO_PRISMS):
-        problem = wrong_imu_setup(parameters, measurements, recording.imu_samples)
-        if problem and not complete:
-            raise RecordingError(
-                f"{problem}; without three stations there are no poses without it: correct its set-up (--imu-setup)",
-                path=path,
-            )
-    if with_imu and not problem:
-        try:
-            imu = fit_with_imu(
-                parameters,
-                observations,
-                recording.imu_samples,
-                odometry=recording.odometry,
-                origin_ns=origin_ns,
-                noise_scales=motion.noise_scales,
-                tuned=motion.tuned,
-                on_progress=on_progress,
-            )
-        except GeometryError as error:
-            if not complete:
-                raise RecordingError(f"{error}; --no-imu leaves the IMU out", path=path) from error
-            problem = str(error)
-    series = _PoseSeries(parameters, measurements, sources, origin_ns)
+    prepared = _prepared(recording, path, refine)
+    parameters, observations = prepared.parameters, prepared.observations
+    imu, imu_problem = _fit_imu(prepared, on_progress)
+    series = PoseSeries(parameters, prepared.measurements, prepared.sources, prepared.origin_ns)
     fit: TrajectoryFit | InertialFit | None = None if imu is None else imu.fit
-    without, rest = None, tuple(find_rest(observations)) if complete and imu is not None else ()
-    if imu is None or (complete and imu.unused):
+    motion, without = prepared.motion, None
+    rest = tuple(find_rest(observations)) if prepared.complete and imu is not None else ()
+    if imu is None or (prepared.complete and imu.unused):
         try:
             in_pieces = TrajectoryInPieces(
                 observations,
@@ -236,15 +194,95 @@ def _smoothed(
     found = SmoothedPoses(
         poses=poses,
         observations=observations,
-        sources=sources,
+        sources=prepared.sources,
         motion=motion,
         parameters=parameters,
-        refinement=refined,
+        refinement=prepared.refined,
         rest=rest,
         imu=imu,
-        imu_problem=problem,
+        imu_problem=imu_problem,
     )
     return found, series, fit
+
+
+def _prepared(recording: Recording, path: Path, refine: Refine) -> _Prepared:
+    """Check the measurements, estimate the motion model, and refine the set-up where they contradict it."""
+    parameters = recording.parameters
+    measurements = plausible_measurements(recording)
+    complete = len(measured_prisms(parameters, measurements)) == len(parameters.prisms) >= MIN_PRISMS
+    without_imu = complete or not _has_imu(recording)
+    names = [prism.prism for prism in parameters.prisms]
+    check_layout([prism.position_m for prism in parameters.prisms], names=names, imu=not without_imu)
+    check_measured = check_prisms_measured if without_imu else check_any_measured
+    check_measured(parameters, measurements, path)
+    check_time_span(parameters, measurements, path)
+    origin_ns = min(m.stamp_ns for m in measurements)
+    observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
+    recorded = noise_scales(parameters)
+    if complete:
+        motion = estimate_motion_model(observations, parameters.pipeline, recorded=recorded)
+    else:
+        motion = recorded_motion_model(observations, parameters.pipeline, recorded)
+    refined = None
+    if motion.tuned:
+        refined = refine_recorded_setup(parameters, observations, motion.prior, motion.noise_scales, refine)
+    if refined is not None and refined.used:
+        parameters = with_setup(parameters, refined.parameters, refined.setup, refined.covariance)
+        observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)
+        motion = estimate_motion_model(observations, parameters.pipeline, start=refined.motion_prior)
+    return _Prepared(
+        recording,
+        path,
+        measurements,
+        complete,
+        origin_ns,
+        parameters,
+        observations,
+        sources,
+        motion,
+        refined,
+    )
+
+
+def _has_imu(recording: Recording) -> bool:
+    return recording.parameters.imu is not None and bool(recording.imu_samples)
+
+
+def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -> tuple[ImuUse | None, str]:
+    """Return the trajectory with the IMU, and why there is none although the recording has one.
+
+    Raises RecordingError where there are no poses without it.
+    """
+    recording, parameters, path = prepared.recording, prepared.parameters, prepared.path
+    if parameters.imu is None:
+        return None, ""
+    if not recording.imu_samples:
+        return None, "the recording has no IMU samples; give --imu, a file of tsgt import imu, or --no-imu"
+    if prepared.complete or len(parameters.prisms) == TWO_PRISMS:
+        problem = wrong_imu_setup(parameters, prepared.measurements, recording.imu_samples)
+        if problem and not prepared.complete:
+            raise RecordingError(
+                f"{problem}; without three stations there are no poses without it: correct its set-up (--imu-setup)",
+                path=path,
+            )
+        if problem:
+            return None, problem
+    try:
+        imu = fit_with_imu(
+            parameters,
+            prepared.observations,
+            recording.imu_samples,
+            odometry=recording.odometry,
+            origin_ns=prepared.origin_ns,
+            noise_scales=prepared.motion.noise_scales,
+            tuned=prepared.motion.tuned,
+            on_progress=on_progress,
+        )
+    except GeometryError as error:
+        if not prepared.complete:
+            raise RecordingError(f"{error}; --no-imu leaves the IMU out", path=path) from error
+        return None, str(error)
+    return imu, ""
 
 
 def estimate_motion_model(
@@ -277,109 +315,3 @@ def recorded_motion_model(
     """Return the hyperparameters of a recording; arguments as for :func:`estimate_motion_model`."""
     scales = np.full((len(observations.frames), 3), pipeline.noise_scale) if recorded is None else recorded
     return MotionModel(pipeline.motion, scales, overall_scale(observations, scales), tuned=False)
-
-
-class _PoseSeries:
-    """Poses at the epochs from the first to the last usable measurement."""
-
-    def __init__(
-        self,
-        parameters: Parameters,
-        measurements: Sequence[Measurement],
-        sources: Sequence[Measurement],
-        origin_ns: int,
-    ) -> None:
-        self.origin_ns = origin_ns
-        stations = {station.station: station for station in parameters.stations}
-        columns = {prism.prism: column for column, prism in enumerate(parameters.prisms)}
-        self._parameters, self._output = parameters, ContinuousPoseOutput(parameters)
-        self._times_ns = np.array([measured_at_ns(m, stations[m.station]) for m in sources], dtype=np.int64)
-        self._stations = np.array([m.station for m in sources], dtype=np.int64)
-        self._prisms = np.array([columns[m.prism] for m in sources], dtype=np.intp)
-        self._unusable_ns = [
-            np.array(
-                sorted(
-                    measured_at_ns(m, stations[m.station])
-                    for m in measurements
-                    if m.prism == prism.prism and m.station in stations and not usable(m)
-                ),
-                dtype=np.int64,
-            )
-            for prism in parameters.prisms
-        ]
-        period_ns = parameters.pipeline.period_ns
-        first, last = -(-int(self._times_ns[0]) // period_ns), int(self._times_ns[-1]) // period_ns
-        self._epochs_ns = np.arange(first, last + 1, dtype=np.int64) * period_ns
-
-    def with_imu(self, imu: ImuUse, without: PoseBatch | None) -> PoseBatch:
-        """Return poses with an IMU; where it is not to be used those without it, or invalid ones."""
-        seen = self._history(imu.fit.residuals_m)
-
-        def chunk(epochs_ns: NDArray[np.int64]) -> PoseBatch:
-            time_s = self._time_s(epochs_ns)
-            states, covariance, common = imu.fit.trajectory.poses_at(time_s)
-            converged = ~imu.unused_at(time_s)
-            return self._output.smoothed(
-                epochs_ns, seen, states, covariance, common=common, converged=converged
-            )
-
-        poses = PoseBatch.collected(len(self._epochs_ns), map(chunk, _chunks(self._epochs_ns)))
-        if without is None:
-            return poses
-        unused = imu.unused_at(self._time_s(poses.stamp_ns))
-        rows = np.concatenate([np.flatnonzero(~unused), len(poses) + np.flatnonzero(unused)])
-        joined = PoseBatch.concatenated([poses, without]).select(rows)
-        return joined.select(np.argsort(joined.stamp_ns, kind="stable"))
-
-    def of_pieces(
-        self, in_pieces: TrajectoryInPieces, on_progress: Callable[[float], None] | None, *, keep: bool
-    ) -> tuple[PoseBatch, list[TrajectoryPiece]]:
-        """Return the poses of a trajectory, computed piece by piece, and the pieces if they are to be kept."""
-        kept: list[TrajectoryPiece] = []
-
-        def chunks() -> Iterator[PoseBatch]:
-            residuals_m, measured, done = np.full((len(self._times_ns), 3), np.nan), 0, 0
-            # A pose looks at residuals before and after it, so that a piece waits for the next one.
-            previous: TrajectoryPiece | None = None
-            for piece in itertools.chain(in_pieces.fitted(on_progress), [None]):
-                if piece is not None:
-                    residuals_m[measured : measured + len(piece.residuals_m)] = piece.residuals_m
-                    measured += len(piece.residuals_m)
-                    if keep:
-                        kept.append(piece)
-                if previous is not None:
-                    until_s = np.inf if piece is None else piece.trajectory.knots.time_s[0]
-                    stop = int(np.searchsorted(self._time_s(self._epochs_ns), until_s))
-                    yield from self._of_piece(previous.trajectory, self._epochs_ns[done:stop], residuals_m)
-                    done = stop
-                previous = piece
-
-        return PoseBatch.collected(len(self._epochs_ns), chunks()), kept
-
-    def _of_piece(
-        self, trajectory: Trajectory, epochs_ns: NDArray[np.int64], residuals_m: FloatArray
-    ) -> Iterator[PoseBatch]:
-        seen = self._history(residuals_m)
-        for some_ns in _chunks(epochs_ns):
-            time_s = self._time_s(some_ns)
-            states, covariance = trajectory.at(time_s, dim=POSE_DIM)
-            common = trajectory.common_at(time_s, dim=POSE_DIM)
-            yield self._output.smoothed(some_ns, seen, states, covariance, common=common)
-
-    def _time_s(self, epochs_ns: NDArray[np.int64]) -> FloatArray:
-        """Return the times of epochs from the trajectory's origin."""
-        return np.asarray((epochs_ns - self.origin_ns) / 1e9)
-
-    def _history(self, residuals_m: FloatArray) -> MeasurementHistory:
-        return MeasurementHistory(
-            times_ns=self._times_ns,
-            stations=self._stations,
-            prisms=self._prisms,
-            residuals_m=np.linalg.norm(residuals_m, axis=1),
-            unusable_ns=self._unusable_ns,
-        )
-
-
-def _chunks(epochs_ns: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    for start in range(0, max(len(epochs_ns), 1), _EPOCHS_PER_CHUNK):
-        yield epochs_ns[start : start + _EPOCHS_PER_CHUNK]

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from tsgt.errors import GeometryError
-from tsgt.geometry.inertial.factors import InertialFactors
 from tsgt.geometry.inertial.initialisation import MIN_MEASUREMENTS, search_heading, states_on_tracks
 from tsgt.geometry.inertial.odometry import Odometry, covered_steps, rejected_steps
 from tsgt.geometry.inertial.preintegration import contiguous, preintegrate
@@ -78,6 +77,17 @@ class WheelsFit:
     covered: NDArray[np.bool_]  # (K - 1,) steps between knots that samples cover
     rejected: NDArray[np.bool_]  # (K - 1,) those that contradict IMU and prisms
 
+    @classmethod
+    def joined(cls, parts: list[WheelsFit]) -> WheelsFit | None:
+        """Return that of a trajectory in parts; None without wheel odometry."""
+        if not parts:
+            return None
+        return cls(
+            np.concatenate([part.sigmas for part in parts]),
+            np.concatenate([part.covered for part in parts]),
+            np.concatenate([part.rejected for part in parts]),
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class InertialFit:
@@ -135,7 +145,6 @@ def fit_inertial_trajectory(
         :class:`~tsgt.geometry.inertial.sensitivity.InertialSensitivity`.
     on_progress : Called with the completed share of the work, 0 to 1.
     """
-    report_progress = on_progress or (lambda _: None)
     mounting = Mounting.of(imu, reference_m)
     of_states = mounting if gyro_only is None else replace(mounting, position=np.zeros(3))
     mounted = replace(observations, layout=of_states.in_imu(observations.layout))
@@ -146,103 +155,154 @@ def fit_inertial_trajectory(
     setup = InertialSetup(
         contiguous(samples, noise, start_s=float(time_s[0]), end_s=float(time_s[-1])), noise, gyro_only
     )
-    wheels = None if odometry is None else Odometry.of(*odometry, of_states, reference_m)
     prior = Gravity.of(imu)
     if gyro_only is None:
         prior = prior.with_matrix(imu.noise.accelerometer_scale_misalignment, mounting.rotation[2])
     near, gravity = find_start(mounted, setup, prior)
-    count = max(round(float(time_s[-1] - time_s[0]) / SEGMENT_S), 1)
-    edges_s = np.linspace(time_s[0], time_s[-1], count + 1)
-    ends = [0, *time_s.searchsorted(edges_s[1:-1]).tolist(), len(time_s)]
-    knot_index = nearest_knots(time_s, mounted.time_s)
-
-    def solve(
-        start_s: float, end_s: float, near: InertialStates | None, guess: InertialStates | None = None
-    ) -> tuple[InertialSolution, Observations, int]:
-        """Solve a stretch from states close to it, or from a guess of all states."""
-        solved = slice(*time_s.searchsorted((start_s, np.nextafter(end_s, np.inf))))
-        rows = slice(*knot_index.searchsorted((solved.start, solved.stop)))
-        some = mounted.select(rows)
-        preintegrated = None
-        if guess is not None:
-            guess = guess.select(solved)
-        else:
-            assert near is not None  # noqa: S101 (one of both)
-            guess, preintegrated = extended(near, time_s[solved], some, setup)
-            if wheels is not None:
-                guess = guess.with_wheels()
-        factors = InertialFactors.between(
-            setup.samples,
-            guess.select(slice(None, -1)),
-            guess.time_s[1:],
-            noise,
-            gyro_only=gyro_only,
-            odometry=wheels,
-            found=preintegrated,
-        )
-        found = solve_inertial(some, replace(setup, odometry=wheels), guess, gravity, factors=factors)
-        if wheels is not None:
-            found = _with_large_slip(found, some, replace(setup, odometry=wheels))
-        return found, some, solved.start
-
-    first = int(np.clip(edges_s.searchsorted(near.time_s[0], side="right") - 1, 0, count - 1))
-    whole: tuple[InertialSolution, Observations, int] | None = None
-    while whole is None and (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
-        margin_s = 0.5 * (START_GROWTH - 1.0) * length_s
-        grown = solve(near.time_s[0] - margin_s, near.time_s[-1] + margin_s, near)
-        near = grown[0].knots
-        if len(near) == len(time_s):
-            whole = grown
-    parts: dict[int, _Part] = {}
-    for number in [*range(first, count), *range(first - 1, -1, -1)]:
-        report_progress(len(parts) / count)
-        if parts:
-            near = parts[number - 1 if number > first else number + 1].knots
-        ends_s = edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S
-        solution, some, offset = whole if whole is not None else solve(*ends_s, near)
-        kept = slice(ends[number] - offset, ends[number + 1] - offset)
-        parts[number] = _Part.of(solution, some, kept, of_states, setup_jacobian, mounting_factor)
-    ordered = [parts[number] for number in range(count)]
-    if count > 1 and len(np.unique(mounted.prism)) == 1:
-        ordered = []
-        guess = concatenate_inertial_states([parts[number].knots for number in range(count)])
-        for begin in range(0, count, ALONE_SEGMENTS):
-            end = min(begin + ALONE_SEGMENTS, count)
-            margins_s = edges_s[begin] - SEGMENT_S, edges_s[end] + SEGMENT_S
-            solution, some, offset = solve(*margins_s, None, guess)
-            kept = slice(ends[begin] - offset, ends[end] - offset)
-            ordered.append(_Part.of(solution, some, kept, of_states, setup_jacobian, mounting_factor))
-    report_progress(1.0)
-    middle = ordered[len(ordered) // 2]
+    wheels = None if odometry is None else Odometry.of(*odometry, of_states, reference_m)
+    problem = _Problem(
+        mounted,
+        replace(setup, odometry=wheels),
+        gravity,
+        time_s,
+        nearest_knots(time_s, mounted.time_s),
+        of_states,
+        setup_jacobian,
+        mounting_factor,
+    )
+    parts = problem.solved_in_segments(near, on_progress or (lambda _: None))
+    if len(parts) > 1 and len(np.unique(mounted.prism)) == 1:
+        parts = problem.solved_together(parts)
     trajectory = InertialTrajectory(
-        concatenate_inertial_states([part.knots for part in ordered]),
-        middle.gravity,
+        concatenate_inertial_states([part.knots for part in parts]),
+        parts[len(parts) // 2].gravity,
         setup.samples,
         of_states,
-        np.concatenate([part.covariance for part in ordered]),
-        np.concatenate([part.cross_covariance for part in ordered])[: len(time_s) - 1],
+        np.concatenate([part.covariance for part in parts]),
+        np.concatenate([part.cross_covariance for part in parts])[: len(time_s) - 1],
         gyro_only,
         None
         if setup_jacobian is None
-        else np.concatenate([part.displacement for part in ordered if part.displacement is not None]),
+        else np.concatenate([part.displacement for part in parts if part.displacement is not None]),
         mounting_factor,
     )
     return InertialFit(
         trajectory,
         observations,
-        np.concatenate([part.residuals_m for part in ordered]),
-        np.concatenate([part.squared_distances for part in ordered]),
-        np.concatenate([part.weights for part in ordered]),
-        np.concatenate([part.residual_variances_m2 for part in ordered]),
-        max(part.tilt_sigma_rad for part in ordered),
-        None
-        if wheels is None
-        else WheelsFit(
-            np.concatenate([part.wheels.sigmas for part in ordered if part.wheels]),
-            np.concatenate([part.wheels.covered for part in ordered if part.wheels]),
-            np.concatenate([part.wheels.rejected for part in ordered if part.wheels]),
-        ),
+        np.concatenate([part.residuals_m for part in parts]),
+        np.concatenate([part.squared_distances for part in parts]),
+        np.concatenate([part.weights for part in parts]),
+        np.concatenate([part.residual_variances_m2 for part in parts]),
+        max(part.tilt_sigma_rad for part in parts),
+        WheelsFit.joined([part.wheels for part in parts if part.wheels is not None]),
     )
+
+
+class _Solved(NamedTuple):
+    """A stretch of the trajectory: its solution, its measurements, and the number of its first knot."""
+
+    solution: InertialSolution
+    observations: Observations
+    first_knot: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """A whole recording, of which stretches are solved."""
+
+    observations: Observations  # With the layout in the axes of the IMU
+    setup: InertialSetup
+    gravity: Gravity
+    time_s: FloatArray  # (K,) knots
+    knot_index: NDArray[np.intp]  # (M,) knot of each measurement
+    mounting: Mounting
+    setup_jacobian: SetupJacobian | None
+    mounting_factor: FloatArray | None
+
+    @property
+    def _edges_s(self) -> FloatArray:
+        """Begin of each segment, and the end of the last."""
+        first_s, last_s = float(self.time_s[0]), float(self.time_s[-1])
+        return np.linspace(first_s, last_s, max(round((last_s - first_s) / SEGMENT_S), 1) + 1)
+
+    def solved_in_segments(
+        self, near: InertialStates, report_progress: Callable[[float], None]
+    ) -> list[_Part]:
+        """Solve segment by segment, from the one that contains the first of the states ``near`` to both ends."""
+        edges_s = self._edges_s
+        count = len(edges_s) - 1
+        first = int(np.clip(edges_s.searchsorted(near.time_s[0], side="right") - 1, 0, count - 1))
+        near, whole = self._grown(near)
+        parts: dict[int, _Part] = {}
+        for number in [*range(first, count), *range(first - 1, -1, -1)]:
+            report_progress(len(parts) / count)
+            if parts:
+                near = parts[number - 1 if number > first else number + 1].knots
+            solved = whole or self._solved_near(
+                edges_s[number] - OVERLAP_S, edges_s[number + 1] + OVERLAP_S, near
+            )
+            parts[number] = self._kept(solved, number, number + 1)
+        report_progress(1.0)
+        return [parts[number] for number in range(count)]
+
+    def solved_together(self, parts: list[_Part]) -> list[_Part]:
+        """Solve several segments at once, from their solutions one by one."""
+        edges_s, guess = self._edges_s, concatenate_inertial_states([part.knots for part in parts])
+        together = []
+        for begin in range(0, len(parts), ALONE_SEGMENTS):
+            end = min(begin + ALONE_SEGMENTS, len(parts))
+            knots, rows = self._within(edges_s[begin] - SEGMENT_S, edges_s[end] + SEGMENT_S)
+            some = self.observations.select(rows)
+            solved = _Solved(self._solution(some, guess.select(knots)), some, knots.start)
+            together.append(self._kept(solved, begin, end))
+        return together
+
+    def _grown(self, near: InertialStates) -> tuple[InertialStates, _Solved | None]:
+        """Solve ever longer stretches around states, until it is a segment, or the whole recording, which is returned, too."""
+        while (length_s := near.time_s[-1] - near.time_s[0]) * START_GROWTH < SEGMENT_S:
+            margin_s = 0.5 * (START_GROWTH - 1.0) * length_s
+            solved = self._solved_near(near.time_s[0] - margin_s, near.time_s[-1] + margin_s, near)
+            near = solved.solution.knots
+            if len(near) == len(self.time_s):
+                return near, solved
+        return near, None
+
+    def _solved_near(self, start_s: float, end_s: float, near: InertialStates) -> _Solved:
+        """Solve a stretch from states close to it."""
+        knots, rows = self._within(start_s, end_s)
+        some = self.observations.select(rows)
+        guess, preintegrated = extended(near, self.time_s[knots], some, self.setup)
+        if self.setup.odometry is not None:
+            guess = guess.with_wheels()
+        return _Solved(self._solution(some, guess, preintegrated), some, knots.start)
+
+    def _within(self, start_s: float, end_s: float) -> tuple[slice, slice]:
+        """Return the knots of a stretch, and the measurements at them."""
+        knots = slice(*self.time_s.searchsorted((start_s, np.nextafter(end_s, np.inf))).tolist())
+        return knots, slice(*self.knot_index.searchsorted((knots.start, knots.stop)).tolist())
+
+    def _solution(
+        self, observations: Observations, guess: InertialStates, preintegrated: Preintegrated | None = None
+    ) -> InertialSolution:
+        """Solve a stretch from a guess of all its states; ``preintegrated``: the motions between them, if known."""
+        setup = self.setup
+        factors = setup.factors(guess, preintegrated)
+        found = solve_inertial(observations, setup, guess, self.gravity, factors=factors)
+        return found if setup.odometry is None else _with_large_slip(found, observations, setup)
+
+    def _kept(self, solved: _Solved, begin: int, end: int) -> _Part:
+        """Keep the segments from ``begin`` to before ``end`` of a solution."""
+        inner = self.time_s.searchsorted(self._edges_s[1:-1]).tolist()
+        ends = [0, *inner, len(self.time_s)]
+        kept = slice(ends[begin] - solved.first_knot, ends[end] - solved.first_knot)
+        return _Part.of(
+            solved.solution,
+            solved.observations,
+            kept,
+            self.mounting,
+            self.setup_jacobian,
+            self.mounting_factor,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -208,7 +208,7 @@ class PoseRecord(FiniteNumbers):
     reason: Reason
     """Why it is invalid: ``outage`` (a prism without measurements for too long), ``station_status`` (the instrument
     reported an error), ``degenerate_geometry`` (prisms collinear or coincident), ``residual`` (the prisms miss their
-    layout by too much), ``uncertain`` (all prisms are measured, but the pose is not known well enough), ``tilt`` (the
+    layout by too much), ``uncertain`` (the pose is not known well enough, or nothing confirms it yet), ``tilt`` (the
     robot would lean too far: mirrored layout or swapped prisms), ``contradicted`` (with one or two stations: the IMU has contradicted
     their measurements, so a tripod or prism may have moved; until the master is restarted or takes another set-up). Empty when valid."""
     quality: Quality | None = None

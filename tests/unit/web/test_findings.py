@@ -8,10 +8,11 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import pytest
-from harness.files.records import IMU_STATUS, SETUP, START
+from harness.files.records import IMU_STATUS, POSE, SETUP, START
 from harness.readers.web import feed, mission, pose, station, status
 
-from tsgt.recording import EventRecord, SetupGeofence, SetupRecord
+from tsgt.recording import EventRecord, SetupGeofence, SetupRecord, ValidityLimits
+from tsgt.web.mission.findings import explanation
 
 if TYPE_CHECKING:
     from tsgt.web.mission.state import MissionState
@@ -134,3 +135,34 @@ def test_parked_robot_does_not_change_the_verdict(limit_m: float) -> None:
     shown = [at(state, i / 5, limit_m + noise.gauss(0.0, 0.003), 20.0)[0][:12] for i in range(500)]
     assert sum(a != b for a, b in pairwise(shown)) <= 1
     assert at(state, 101.0, limit_m - 0.2, 20.0) != at(state, 103.0, limit_m + 0.2, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "words"),
+    [
+        (0.002, "the measurements do not confirm the pose yet"),
+        (0.1, "position uncertain: 100 mm, limit 50 mm"),
+    ],
+)
+def test_cause_of_an_uncertain_pose(sigma_m: float, words: str) -> None:
+    """A pose within the limits may rest on a wrong prism, or on measurements that contradict each other."""
+    limits = ValidityLimits(
+        promise="",
+        reference_point="robot",
+        position_sigma_m=0.01,
+        rotation_sigma_rad=0.01,
+        predicted_position_sigma_m=0.05,
+        predicted_rotation_sigma_rad=0.05,
+        residual_m=0.02,
+        tilt_rad=1.0,
+        outage_s=1.0,
+    )
+    covariance = tuple(
+        (sigma_m if row < 3 else 0.001) ** 2 if row == column else 0.0
+        for row in range(6)
+        for column in range(6)
+    )
+    uncertain = replace(
+        POSE, kind="predicted", estimator="continuous", valid=False, reason="uncertain", covariance=covariance
+    )
+    assert explanation(uncertain, limits, {}) == words

@@ -225,7 +225,13 @@ def _uncertain(pose: PoseRecord, limits: ValidityLimits | None) -> str:
         rotation_limit = limits.rotation_sigma_rad if smoothed else limits.predicted_rotation_sigma_rad
     if position_limit is None or rotation_limit is None:
         return f"uncertain: {position_mm:.0f} mm, {rotation_deg:.1f} deg"
-    if position_mm / 1e3 / position_limit >= math.radians(rotation_deg) / rotation_limit:
+    position_share, rotation_share = (
+        position_mm / 1e3 / position_limit,
+        math.radians(rotation_deg) / rotation_limit,
+    )
+    if not pose.valid and max(position_share, rotation_share) <= 1.0:
+        return "the measurements do not confirm the pose yet"
+    if position_share >= rotation_share:
         return f"position uncertain: {position_mm:.0f} mm, limit {1e3 * position_limit:.0f} mm"
     return f"rotation uncertain: {rotation_deg:.1f} deg, limit {math.degrees(rotation_limit):.1f} deg"
 

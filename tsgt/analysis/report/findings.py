@@ -189,14 +189,7 @@ def collect_findings(
     records = station_records(measurements, [s.station for s in parameters.stations])
     limit_ns = parameters.pipeline.outage_limit_ns
     fitted = 0.5 if with_held_out else 0.8
-
-    def attempt(name: str, compute: Callable[[], T]) -> T | None:
-        try:
-            return compute()
-        except (RecordingError, GeometryError) as error:
-            problems[name] = str(error).removeprefix(f"{path}: ")
-            return None
-
+    attempt = _Attempts(path, problems)
     continuous = attempt(
         "continuous",
         lambda: smooth_recording(
@@ -233,19 +226,8 @@ def collect_findings(
     smoothed = None if continuous is None else continuous.poses
     both: dict[Estimator, PoseBatch | None] = {"linear": linear, "continuous": smoothed}
     poses_of = {name: poses for name, poses in both.items() if poses is not None}
-    errors: dict[Estimator, PoseErrorStatistics] = {}
-    details: dict[Estimator, PoseErrorDetails] = {}
-    aligned: dict[Estimator, AlignedErrorStatistics] = {}
-    stationary: dict[Estimator, StationaryStatistics] = {}
-    if reference is not None:
-        intervals_ns = () if distances is None else distances.stationary_ns
-        for name, poses in poses_of.items():
-            errors[name] = compare(poses, reference, centroid_m)
-            details[name] = error_details(poses, reference)
-            stationary[name] = stationary_errors(poses, reference, intervals_ns, centroid_m).statistics()
-            if align is not None and errors[name].compared:
-                result = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
-                aligned |= {} if result is None else {name: result}
+    intervals_ns = () if distances is None else distances.stationary_ns
+    against = _compare_with_reference(poses_of, reference, centroid_m, intervals_ns, align, attempt)
     return Findings(
         recording=recording,
         path=path,
@@ -269,8 +251,8 @@ def collect_findings(
         residuals={} if continuous is None else residual_statistics(continuous.fit, continuous.sources),
         outliers=[] if continuous is None else outliers(continuous.fit, continuous.sources),
         normalised=np.empty((0, 3)) if continuous is None else normalised_residuals(continuous.fit),
-        reference_errors=errors,
-        error_details=details,
+        reference_errors=against.errors,
+        error_details=against.details,
         live=None
         if not poses_of
         # Lines that cannot be read were an error, or skipped, when the recording was loaded.
@@ -281,8 +263,8 @@ def collect_findings(
             reference,
             keep_going=True,
         ),
-        aligned_errors=aligned,
-        stationary_errors=stationary,
+        aligned_errors=against.aligned,
+        stationary_errors=against.stationary,
         reference=reference,
         pose_noise=attempt("pose_noise", lambda: _pose_noise(recording, distances)),
         diagnosis=None
@@ -293,6 +275,54 @@ def collect_findings(
         ),
         problems=problems,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempts:
+    """Computes what may be impossible, and notes why it is."""
+
+    path: Path
+    problems: dict[str, str]
+
+    def __call__(self, name: str, compute: Callable[[], T]) -> T | None:
+        try:
+            return compute()
+        except (RecordingError, GeometryError) as error:
+            self.problems[name] = str(error).removeprefix(f"{self.path}: ")
+            return None
+
+
+@dataclass(frozen=True, slots=True)
+class _AgainstReference:
+    """Errors of each estimator against the reference."""
+
+    errors: dict[Estimator, PoseErrorStatistics] = field(default_factory=dict)
+    details: dict[Estimator, PoseErrorDetails] = field(default_factory=dict)
+    aligned: dict[Estimator, AlignedErrorStatistics] = field(default_factory=dict)
+    stationary: dict[Estimator, StationaryStatistics] = field(default_factory=dict)
+
+
+def _compare_with_reference(
+    poses_of: dict[Estimator, PoseBatch],
+    reference: Reference | None,
+    centroid_m: FloatArray,
+    stationary_ns: Sequence[tuple[int, int]],
+    align: Align | None,
+    attempt: _Attempts,
+) -> _AgainstReference:
+    """Compare the poses of each estimator with the reference, if there is one."""
+    found = _AgainstReference()
+    if reference is None:
+        return found
+    for name, poses in poses_of.items():
+        found.errors[name] = compare(poses, reference, centroid_m)
+        found.details[name] = error_details(poses, reference)
+        found.stationary[name] = stationary_errors(poses, reference, stationary_ns, centroid_m).statistics()
+        if align is not None and found.errors[name].compared:
+            aligned = attempt("aligned", partial(compare_aligned, poses, reference, centroid_m, align))
+            if aligned is not None:
+                found.aligned[name] = aligned
+    return found
 
 
 def difference(a: PoseBatch, b: PoseBatch, centroid_m: FloatArray) -> Difference:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -63,15 +64,19 @@ if TYPE_CHECKING:
         Align,
         HeldOutErrors,
         InterPrismDistances,
+        LiveComparison,
         Outlier,
         PairDistances,
         Predictor,
+        Reference,
+        ResidualStatistics,
     )
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.refinement import Refine
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.cli.desk.reference import Comparison
     from tsgt.cli.recordings import ImuOptions
+    from tsgt.estimation import PoseBatch
     from tsgt.model import ReferencePoint
     from tsgt.recording import Recording
 
@@ -179,91 +184,148 @@ def evaluate(
             as_json=as_json,
         )
         return
+    found = _evaluated(
+        loaded,
+        recording,
+        reference,
+        reference_path,
+        align=alignment,
+        with_held_out=with_held_out,
+        refine=refine,
+        keep_going=keep_going,
+    )
+    if as_json:
+        print_json(_keys(found))
+    else:
+        _print_evaluation(found, reference_path, alignment)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Evaluation:
+    """What is printed of a recording."""
+
+    recording: Recording
+    path: Path
+    continuous: SmoothedRecording
+    poses: PoseBatch  # Of the recording's estimator
+    distances: InterPrismDistances
+    held_out: dict[Predictor, HeldOutErrors] | None
+    outliers: list[Outlier]
+    residuals: dict[int, dict[str, ResidualStatistics]]
+    diagnosis: Diagnosis | None
+    comparisons: dict[Estimator, Comparison]  # With the reference
+    live: LiveComparison | None
+
+
+def _evaluated(
+    loaded: Recording,
+    path: Path,
+    reference: Reference | None,
+    reference_path: Path | None,
+    *,
+    align: Align | None,
+    with_held_out: bool,
+    refine: Refine,
+    keep_going: bool,
+) -> _Evaluation:
+    """Evaluate a recording."""
     parameters = loaded.parameters
     with progress("fitting", first=TUNING) as on_progress:
-        continuous = smooth_recording(loaded, path=recording, refine=refine, on_progress=on_progress)
+        continuous = smooth_recording(loaded, path=path, refine=refine, on_progress=on_progress)
     poses = continuous.poses
     if parameters.pipeline.estimator != "continuous":
-        poses = process(loaded, path=recording)
-    found = inter_prism(parameters, build_tracks(parameters, loaded.measurements))
-    predicted = _held_out(loaded, continuous, recording, refine) if with_held_out else None
-    rejected = outliers(continuous.fit, continuous.sources)
-    residuals = residual_statistics(continuous.fit, continuous.sources)
-    diagnosis = _diagnosis(loaded, continuous, predicted, found)
-    compared: dict[Estimator, Comparison] = {}
+        poses = process(loaded, path=path)
+    distances = inter_prism(parameters, build_tracks(parameters, loaded.measurements))
+    held_out = _held_out(loaded, continuous, path, refine) if with_held_out else None
+    comparisons: dict[Estimator, Comparison] = {}
     if reference is not None and reference_path is not None:
-        paths = (recording, reference_path)
-        compared = compare_estimators(
-            loaded, continuous, reference, paths, stationary_ns=found.stationary_ns, align=alignment
+        paths = (path, reference_path)
+        comparisons = compare_estimators(
+            loaded, continuous, reference, paths, stationary_ns=distances.stationary_ns, align=align
         )
-    live = compare_live(loaded, recording, continuous.poses, reference, keep_going=keep_going)
-    if as_json:
-        chosen = compared.get(parameters.pipeline.estimator)
-        print_json(
-            {
-                "estimator": parameters.pipeline.estimator,
-                "reference_point": dataclasses.asdict(parameters.reference_point),
-                "duration_s": duration_s(poses),
-                **pose_counts(poses),
-                "epochs": found.epochs,
-                "invalid_epochs": found.invalid_epochs,
-                "inter_prism_mm": _figures(found.dynamic),
-                "still_s": found.stationary_s,
-                "inter_prism_static_mm": _figures(found.static),
-                **({} if diagnosis is None else {"diagnosis": diagnosis.numbers()}),
-                **({} if predicted is None else held_out_keys(predicted)),
-                **refinement_keys(continuous.refinement, continuous.parameters),
-                **motion_keys(continuous),
-                **imu_keys(continuous.imu, continuous.imu_problem),
-                "residuals": {
-                    station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
-                    for station, axes in residuals.items()
-                },
-                "outliers": [dataclasses.asdict(outlier) for outlier in rejected],
-                **({} if chosen is None else chosen.keys()),
-                **(
-                    {"estimators": {name: each.keys() for name, each in compared.items()}} if compared else {}
-                ),
-                **({} if live is None else {"live": live.keys()}),
-            }
-        )
-        return
-    errors = {name: each.unaligned for name, each in compared.items()}
-    print_verdicts(assess(loaded, recording, continuous, found, errors, diagnosis))
-    click.echo(f"\n{pose_summary(poses)} over {duration_s(poses):.1f} s")
-    valid = found.epochs - found.invalid_epochs
-    click.echo(
-        f"\nDistances between prisms at 20 Hz, interpolated: {valid} of {found.epochs} epochs valid (mm)"
+    return _Evaluation(
+        recording=loaded,
+        path=path,
+        continuous=continuous,
+        poses=poses,
+        distances=distances,
+        held_out=held_out,
+        outliers=outliers(continuous.fit, continuous.sources),
+        residuals=residual_statistics(continuous.fit, continuous.sources),
+        diagnosis=_diagnosis(loaded, continuous, held_out, distances),
+        comparisons=comparisons,
+        live=compare_live(loaded, path, continuous.poses, reference, keep_going=keep_going),
     )
-    _print_pairs(found.dynamic)
+
+
+def _keys(found: _Evaluation) -> dict[str, Any]:
+    """Return what ``--json`` prints."""
+    parameters, continuous, distances = found.recording.parameters, found.continuous, found.distances
+    keys = {
+        "estimator": parameters.pipeline.estimator,
+        "reference_point": dataclasses.asdict(parameters.reference_point),
+        "duration_s": duration_s(found.poses),
+        **pose_counts(found.poses),
+        "epochs": distances.epochs,
+        "invalid_epochs": distances.invalid_epochs,
+        "inter_prism_mm": _figures(distances.dynamic),
+        "still_s": distances.stationary_s,
+        "inter_prism_static_mm": _figures(distances.static),
+    }
+    if found.diagnosis is not None:
+        keys["diagnosis"] = found.diagnosis.numbers()
+    if found.held_out is not None:
+        keys |= held_out_keys(found.held_out)
+    keys |= refinement_keys(continuous.refinement, continuous.parameters)
+    keys |= motion_keys(continuous)
+    keys |= imu_keys(continuous.imu, continuous.imu_problem)
+    keys["residuals"] = {
+        station: {axis: dataclasses.asdict(figures) for axis, figures in axes.items()}
+        for station, axes in found.residuals.items()
+    }
+    keys["outliers"] = [dataclasses.asdict(outlier) for outlier in found.outliers]
+    chosen = found.comparisons.get(parameters.pipeline.estimator)
+    if chosen is not None:
+        keys |= chosen.keys()
+    if found.comparisons:
+        keys["estimators"] = {name: each.keys() for name, each in found.comparisons.items()}
+    if found.live is not None:
+        keys["live"] = found.live.keys()
+    return keys
+
+
+def _print_evaluation(found: _Evaluation, reference_path: Path | None, align: Align | None) -> None:
+    parameters, continuous, distances = found.recording.parameters, found.continuous, found.distances
+    errors = {name: each.unaligned for name, each in found.comparisons.items()}
+    print_verdicts(assess(found.recording, found.path, continuous, distances, errors, found.diagnosis))
+    click.echo(f"\n{pose_summary(found.poses)} over {duration_s(found.poses):.1f} s")
+    valid = distances.epochs - distances.invalid_epochs
     click.echo(
-        f"\nDistances between prisms while stationary, raw pairs within {found.stationary_s:.1f} s (mm)"
+        f"\nDistances between prisms at 20 Hz, interpolated: {valid} of {distances.epochs} epochs valid (mm)"
     )
-    _print_pairs(found.static)
-    if predicted is not None:
+    _print_pairs(distances.dynamic)
+    click.echo(
+        f"\nDistances between prisms while stationary, raw pairs within {distances.stationary_s:.1f} s (mm)"
+    )
+    _print_pairs(distances.static)
+    if found.held_out is not None:
         click.echo("\nHeld-out prediction error (mm)")
-        _print_held_out(predicted)
+        _print_held_out(found.held_out)
         click.echo(
             "\nThe same errors in the sigmas that covariance and noise state (1 and 0.1 % if they are right)"
         )
-        _print_normalised(predicted)
+        _print_normalised(found.held_out)
     click.echo(f"\n{refinement_text(continuous.refinement, continuous.parameters)}")
     used = imu_text(continuous)
     if used is not None:
         click.echo(f"\n{used}")
     click.echo(f"\n{motion_text(continuous, parameters.pipeline.motion)}")
-    click.echo("\nNormalised residuals of the continuous trajectory")
-    rows = [
-        [f"{station} {axis.replace('_', ' ')}", str(f.n), *numbers(f.mean, f.std), f"{f.beyond_3_sigma:.2%}"]
-        for station, axes in residuals.items()
-        for axis, f in axes.items()
-    ]
-    print_table(["station", "n", "mean", "std", "beyond 3"], rows)
-    _print_outliers(rejected)
-    if compared and reference_path is not None:
-        print_comparisons(compared, reference_path, alignment, parameters.reference_point)
-    if live is not None:
-        print_live(live, parameters)
+    _print_residuals(found.residuals)
+    _print_outliers(found.outliers)
+    if found.comparisons and reference_path is not None:
+        print_comparisons(found.comparisons, reference_path, align, parameters.reference_point)
+    if found.live is not None:
+        print_live(found.live, parameters)
 
 
 def _diagnosis(
@@ -309,6 +371,16 @@ def _print_pairs(pairs: Sequence[PairDistances]) -> None:
         figures = (found.reference, found.mean, found.std, found.mean_abs_error, found.p95)
         rows.append([pair.name, str(found.valid), *numbers(*figures)])
     print_table(["pair", "n", "reference", "mean", "std", "mean |error|", "p95 |error|"], rows)
+
+
+def _print_residuals(residuals: dict[int, dict[str, ResidualStatistics]]) -> None:
+    click.echo("\nNormalised residuals of the continuous trajectory")
+    rows = [
+        [f"{station} {axis.replace('_', ' ')}", str(f.n), *numbers(f.mean, f.std), f"{f.beyond_3_sigma:.2%}"]
+        for station, axes in residuals.items()
+        for axis, f in axes.items()
+    ]
+    print_table(["station", "n", "mean", "std", "beyond 3"], rows)
 
 
 def _print_held_out(predicted: dict[Predictor, HeldOutErrors]) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,6 +96,7 @@ class Field:
     key: bytes | None = None
     boot: str = "boot"
     client: asyncio.Task[None] | None = None
+    rng: random.Random = field(default_factory=lambda: random.Random(11))  # noqa: S311 (a test has no secrets)
 
     def start(self) -> None:
         """Start the client."""
@@ -111,6 +113,7 @@ class Field:
                     clock=self.clock,
                     key=self.key,
                     boot=self.boot,
+                    random_bits=self.rng.getrandbits,
                 ),
             )
         )

@@ -464,6 +464,7 @@ class Mission:
             return
         resume = computer.suspend()
         await asyncio.sleep(for_s)
+        self._note_waiting_lines(computer)  # The daemon begins anew
         resume()
 
     async def suspend(self, station: int, for_s: float) -> None:

@@ -126,6 +126,28 @@ def test_suspended_master_restarts(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_master_that_resumes_on_a_full_disk_leaves_a_recording_that_ends_early(tmp_path: Path) -> None:
+    """What it published before it was suspended waits for the disk, and is lost with its run; measurements are delivered again."""
+
+    async def suspend(mission: Mission) -> None:
+        await mission.sleep_until(9.5)
+        disk = mission.computers[MASTER].disk
+        disk.fail_writes(errno.ENOSPC, 9_500_000_000, 24_000_000_000)
+        await mission.sleep_until(10.0)
+        await mission.suspend_master(8.0)
+        await mission.sleep_until(24.0)
+        disk.write_error = None
+
+    result = run_linear_drive(tmp_path, suspend, 44.0, faults=frozenset({FaultKind.MASTER_SUSPEND}))
+    before, after = result.master_logs
+    path = before.recording()
+    assert path is not None
+    assert len(load_recording(path).measurements) < len(before.measurements)
+    assert check_invariants(result) == []
+    assert after.valid_poses().stamp_ns.size > 300
+
+
+@pytest.mark.slow
 def test_disk_that_is_full_for_longer_than_lines_can_wait(tmp_path: Path) -> None:
     """Lines are lost, poses among them; measurements are delivered again, so that each is in the recording once."""
 

@@ -4,7 +4,7 @@
         [--until 90] [--errors NAME ...] [--missions FOLDER]
 
 The missions of the benchmark imu, replayed as they arrived to a live estimator whose IMU is set up wrongly, as in the
-benchmark imu_setup, or whose station 1 moves 60 s after the first measurement (20 mm, 0.5 mrad; named: the first pose that is
+benchmark imu_setup, or whose station 1 moves 60 s after the first measurement (by 10, 20 or 50 mm, 0.5 mrad; named: the first pose that is
 `contradicted`). Per error: when the IMU is confirmed and when an event names a cause (s after the first measurement); then for
 predicted and for smoothed poses, over the whole drive: the share that is valid, the share of these that rests on the IMU, rms errors of
 the prisms' centroid in mm and of the rotation in degrees, mean NEES, and the share of valid poses whose position or rotation is beyond
@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,13 +51,15 @@ def tilted(measurement: PolarMeasurement) -> PolarMeasurement:
     return replace(measurement, zenith_angle_rad=measurement.zenith_angle_rad + float(lifted_rad))
 
 
-def moved(measurement: PolarMeasurement) -> PolarMeasurement:
-    """Move the tripod by 20 mm."""
+def moved(by_m: float, measurement: PolarMeasurement) -> PolarMeasurement:
+    """Move the tripod by a distance, horizontally."""
     if measurement.slope_distance_m is None:
         return measurement
     azimuth, zenith = measurement.horizontal_angle_rad, measurement.zenith_angle_rad
     direction = [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
-    x, y, z = measurement.slope_distance_m * np.array(direction) - [0.0141, 0.0141, 0.0]
+    x, y, z = measurement.slope_distance_m * np.array(direction) - by_m * np.array(
+        [np.sqrt(0.5), np.sqrt(0.5), 0.0]
+    )
     distance_m = float(np.sqrt(x * x + y * y + z * z))
     return replace(
         measurement,
@@ -66,7 +69,11 @@ def moved(measurement: PolarMeasurement) -> PolarMeasurement:
     )
 
 
-FAULTS = {"tripod turned": turned, "tripod tilted": tilted, "tripod moved": moved}
+FAULTS = {
+    "tripod turned": turned,
+    "tripod tilted": tilted,
+    **{f"tripod moved {by_mm} mm": partial(moved, by_mm / 1000) for by_mm in (10, 20, 50)},
+}
 ERRORS = ("none", *CONFIGURED, *SAMPLED, *FAULTS)
 THREE_SIGMA_3D = 14.156
 

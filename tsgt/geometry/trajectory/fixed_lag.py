@@ -314,7 +314,7 @@ class FixedLagSmoother(MeasurementWindow):
             factor = factorise(system.diagonal, system.off_diagonal)
         else:
             outliers = self._solve(knots, MAX_ITERATIONS)
-        self._monitor.update(observations, is_new, sequential_nis, outliers)
+        self._monitor.update(observations, is_new, sequential_nis, outliers, self.residuals_m)
         return self._converged
 
     def _solve(self, guess: States, max_iterations: int) -> NDArray[np.bool_]:

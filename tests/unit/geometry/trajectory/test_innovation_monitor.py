@@ -8,10 +8,11 @@ import pytest
 from tsgt.geometry.trajectory import Observations
 from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
 
-BY_CHANCE, NOT_BY_CHANCE = 20.0, 40.0  # NIS of inconsistent measurements
+BY_CHANCE, IN_RAIN, NOT_BY_CHANCE = 20.0, 38.0, 60.0  # NIS of inconsistent measurements
+OWN_PRISM_M, WRONG_PRISM_M = 0.02, 0.5  # Residuals
 
 
-def _observations(*prisms: int) -> Observations:
+def _observations(*prisms: int, layout: int = 3) -> Observations:
     """One measurement of each of these prisms in turn, a tenth of a second apart."""
     count = len(prisms)
     return Observations(
@@ -23,7 +24,7 @@ def _observations(*prisms: int) -> Observations:
         np.zeros(count, np.intp),
         np.array(prisms, np.intp),
         np.eye(4)[None],
-        np.zeros((3, 3)),
+        np.zeros((layout, 3)),
     )
 
 
@@ -32,26 +33,33 @@ def _monitor_after(
     *,
     alone: int | None = None,
     followed: bool = False,
+    first_followed: bool = True,
     window: int = 99,
     first_nis: float = NOT_BY_CHANCE,
+    layout: int = 3,
+    residual_m: float = 0.0,
 ) -> InnovationMonitor:
     """Follow measurements after a start: ``a``, ``b`` and ``c`` are consistent ones of three prisms, capitals inconsistent ones.
 
-    ``first_nis``: of the first inconsistent one; the others are inconsistent by what chance gives.
+    ``first_nis``: of the first inconsistent one; the others are inconsistent by what chance gives. ``layout``: its prisms.
+    ``residual_m``: of inconsistent ones. ``first_followed``: whether the first one is, where the others are.
     """
     monitor = InnovationMonitor(alone)
-    start = [0, 1]
+    start = [0, 1] if layout > 1 else [0, 0]
     prisms = [*start, *("abc".index(each.lower()) for each in text)]
     wrong = np.array([False, False, *(each.isupper() for each in text)])
     nis = BY_CHANCE * wrong
     nis[wrong.argmax()] *= first_nis / BY_CHANCE
-    monitor.reset(_observations(*start))
+    outlier = wrong & (not followed)
+    outlier[wrong.argmax()] |= not first_followed
+    residuals_m = residual_m * np.eye(3)[np.zeros(len(wrong), np.intp)] * wrong[:, None]
+    monitor.reset(_observations(*start, layout=layout))
     monitor.set_start(0.1)
     for row in range(len(start), len(prisms)):
         rows = slice(max(0, row + 1 - window), row + 1)
-        held = _observations(*prisms[: row + 1]).select(rows)
-        outliers = wrong[rows] & (not followed)
-        monitor.update(held, np.arange(len(held)) == len(held) - 1, nis[row : row + 1], outliers)
+        held = _observations(*prisms[: row + 1], layout=layout).select(rows)
+        is_new = np.arange(len(held)) == len(held) - 1
+        monitor.update(held, is_new, nis[row : row + 1], outlier[rows], residuals_m[rows])
         monitor.select(np.arange(len(held)) > len(held) - window)
     return monitor
 
@@ -99,12 +107,43 @@ def test_time_over_which_inconsistent_measurements_are_followed(
 
 
 @pytest.mark.parametrize("window", [99, 4])
-@pytest.mark.parametrize(("first_nis", "for_s"), [(BY_CHANCE, 0.0), (NOT_BY_CHANCE, 0.2)])
+@pytest.mark.parametrize(("first_nis", "for_s"), [(BY_CHANCE, 0.0), (IN_RAIN, 0.0), (NOT_BY_CHANCE, 0.2)])
 def test_measurements_inconsistent_by_chance_are_not_followed(
     first_nis: float, for_s: float, window: int
 ) -> None:
     """Those of one prism share the error of one prediction: one of them must be beyond what chance gives."""
     monitor = _monitor_after("AAAaaaaa", alone=5, followed=True, first_nis=first_nis, window=window)
+    assert monitor.followed_for_s == pytest.approx(for_s)
+
+
+@pytest.mark.parametrize("window", [99, 4])
+@pytest.mark.parametrize(
+    ("layout", "residual_m", "text", "for_s"),
+    [
+        (1, OWN_PRISM_M, "AAAaaaaa", 0.2),
+        (1, OWN_PRISM_M, "Aaaaaaaa", 0.0),
+        (1, WRONG_PRISM_M, "AAAaaaaa", 0.0),
+        (3, OWN_PRISM_M, "AAAaaaaa", 0.0),
+    ],
+)
+def test_only_prism_is_followed_though_what_was_inconsistent_stays_so(
+    layout: int, residual_m: float, text: str, for_s: float, window: int
+) -> None:
+    """A tripod was moved by 20 mm, and the trajectory moved there within two seconds; another prism would not have followed."""
+    monitor = _monitor_after(text, alone=5, layout=layout, residual_m=residual_m, window=window)
+    assert not monitor.inconsistent_prisms
+    assert monitor.followed_for_s == pytest.approx(for_s)
+
+
+@pytest.mark.parametrize("window", [99, 4])
+@pytest.mark.parametrize(("first_nis", "for_s"), [(BY_CHANCE, 0.0), (NOT_BY_CHANCE, 0.1)])
+def test_first_measurement_counts_though_only_later_ones_are_followed(
+    first_nis: float, for_s: float, window: int
+) -> None:
+    """It is rejected, and may have left the window, before the trajectory follows a station that has moved."""
+    monitor = _monitor_after(
+        "AAAaaaaa", alone=5, followed=True, first_followed=False, first_nis=first_nis, window=window
+    )
     assert monitor.followed_for_s == pytest.approx(for_s)
 
 
@@ -138,7 +177,11 @@ def test_measurements_after_an_outage_are_unproven(text: str, *, needs_two: bool
         wrong = np.array([each.isupper()])
         monitor.select(np.zeros(len(monitor._time_s), np.bool_))
         monitor.update(
-            _observations("abc".index(each.lower())), np.ones(1, np.bool_), BY_CHANCE * wrong, wrong
+            _observations("abc".index(each.lower())),
+            np.ones(1, np.bool_),
+            BY_CHANCE * wrong,
+            wrong,
+            np.zeros((1, 3)),
         )
     assert bool(monitor.inconsistent_prisms) is ambiguous
 

@@ -468,7 +468,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._window = replace(window, knots=found.knots, factors=found.factors)
             outliers = self._accept(observations, knot_index, found.gravity, found.factor, found)
             self._converged &= found.iterations < MAX_ITERATIONS
-        self._monitor.update(observations, is_new, sequential_nis, outliers)
+        self._monitor.update(observations, is_new, sequential_nis, outliers, self.residuals_m)
         return self._converged
 
     def _check_proven(self, new: Observations) -> None:

@@ -31,7 +31,7 @@ from tsgt.model import ImuSamples, PolarMeasurement
 from tsgt.recording import PoseRecord, load_recording, read_imu_samples
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from tsgt.geometry import FloatArray
     from tsgt.model import Measurement, Parameters
@@ -69,7 +69,7 @@ def moved(by_m: float, measurement: PolarMeasurement) -> PolarMeasurement:
     )
 
 
-FAULTS = {
+FAULTS: dict[str, Callable[[PolarMeasurement], PolarMeasurement]] = {
     "tripod turned": turned,
     "tripod tilted": tilted,
     **{f"tripod moved {by_mm} mm": partial(moved, by_mm / 1000) for by_mm in (10, 20, 50)},

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 AMBIGUITY_MARGIN_S = 1.5  # Before the first inconsistent measurement: a few of each prism
 
 NOT_BY_CHANCE_NIS = 45.0
-"""Largest NIS of a station that has moved. Three degrees of freedom exceed 16, the square of ``OUTLIER_THRESHOLD``, once in 900; in
-simulated missions rain, whose noise no covariance states, gave up to 38 (seed 14056 of benchmarks/run.py soak). A tripod moved by 20 mm
-gave 64 to 125 where its prism is the only one, one moved by 10 mm 49 to 71 with two prisms (seeds 13 to 16 of imu_trust).
+"""A station that has moved has at least one larger NIS. Three degrees of freedom exceed 16, the square of ``OUTLIER_THRESHOLD``, once in
+900; in a simulated mission rain, whose noise no covariance states, gave 38 (seed 14056 of benchmarks/run.py soak). A tripod moved by
+20 mm gave 64 to 125 in five drives where its prism is the only one; one moved by 10 mm gave 49 to 71 with two prisms in three drives
+and 22 in a fourth, and 37 in a drive where its prism is the only one (imu_trust, seeds 13 to 16).
 """
 
 OWN_PRISM_M = 0.1
-"""Farther off is a measurement of a wrong prism, and no tripod that was knocked."""
+"""A residual beyond it is that of a wrong prism, not of a tripod that was knocked."""
 
 
 class InnovationMonitor:
@@ -51,8 +52,8 @@ class InnovationMonitor:
         self._consistent_prisms: frozenset[int] = frozenset()  # since the last inconsistent measurement
         self.inconsistent_prisms: frozenset[int] = frozenset()
         self._inconsistent_from_s = np.inf
-        # Of the window, and whether the trajectory follows them
-        self._flagged = self._outliers = self._followed = np.empty(0, np.bool_)
+        # Of the window's measurements: whether they were inconsistent, and whether the trajectory follows them nevertheless
+        self._flagged = self._followed = np.empty(0, np.bool_)
         self._time_s, self._prism = np.empty(0), np.empty(0, np.intp)
         # Of the current ambiguity, by prism: first and last followed measurement that has left the window, and largest NIS
         self._spans_s: dict[int, tuple[float, float]] = {}
@@ -68,8 +69,8 @@ class InnovationMonitor:
     def ambiguous_at(self, time_s: FloatArray, *, margin_s: float = 0.0) -> NDArray[np.bool_]:
         """Whether the state stays ambiguous at times (N,), by the resolved ambiguities, or did shortly before.
 
-        None remains if all flagged measurements are of one prism and still outliers: then these were wrong. Otherwise the
-        trajectory followed the wrong ones, or was bent towards all of them.
+        None remains if all flagged measurements are of one prism and still outliers, and the layout has others: then these were
+        wrong. Otherwise the trajectory followed the wrong ones, or was bent towards all of them.
         """
         found = np.zeros(len(time_s), np.bool_)
         for from_s, until_s in self._ambiguous_intervals_s:
@@ -79,7 +80,7 @@ class InnovationMonitor:
     def reset(self, observations: Observations) -> None:
         """Mark the state as ambiguous while the trajectory of a window is being initialised."""
         self.inconsistent_prisms = frozenset(observations.prism.tolist())
-        self._flagged = self._outliers = self._followed = np.zeros(len(observations), np.bool_)
+        self._flagged = self._followed = np.zeros(len(observations), np.bool_)
         self._time_s, self._prism = observations.time_s, observations.prism
         self._consistent_prisms = frozenset()
         self._succession = 0
@@ -109,9 +110,7 @@ class InnovationMonitor:
     def select(self, rows: NDArray[np.bool_]) -> None:
         """Drop the other measurements of the window."""
         self._extend_spans(self._followed & ~rows)
-        self._flagged, self._outliers, self._followed = (
-            each[rows] for each in (self._flagged, self._outliers, self._followed)
-        )
+        self._flagged, self._followed = self._flagged[rows], self._followed[rows]
         self._time_s, self._prism = self._time_s[rows], self._prism[rows]
 
     def discard_before(self, before_s: float) -> None:
@@ -136,7 +135,7 @@ class InnovationMonitor:
         flagged[~is_new] = self._flagged
         # Measurements that arrive together may each pass the gate and yet be mutually inconsistent.
         flagged[is_new] = (new_nis > OUTLIER_THRESHOLD**2) | outliers[is_new]
-        self._flagged, self._outliers, self._followed = flagged, outliers, flagged & ~outliers
+        self._flagged, self._followed = flagged, flagged & ~outliers
         if len(observations.layout) == 1:
             self._followed = flagged & (np.linalg.norm(residuals_m, axis=1) < OWN_PRISM_M)
         self._time_s, self._prism = observations.time_s, observations.prism

@@ -52,7 +52,7 @@ def _monitor_after(
     nis[wrong.argmax()] *= first_nis / BY_CHANCE
     outlier = wrong & (not followed)
     outlier[wrong.argmax()] |= not first_followed
-    residuals_m = residual_m * np.eye(3)[np.zeros(len(wrong), np.intp)] * wrong[:, None]
+    residuals_m = np.outer(residual_m * wrong, [1.0, 0.0, 0.0])
     monitor.reset(_observations(*start, layout=layout))
     monitor.set_start(0.1)
     for row in range(len(start), len(prisms)):

@@ -34,6 +34,15 @@ def _missing(result: MissionResult) -> dict[int, int]:
     return missing
 
 
+async def _fill_disk(mission: Mission, from_s: float, until_s: float) -> None:
+    """Let the master's disk be full between two true times from the start."""
+    disk = mission.computers[MASTER].disk
+    await mission.sleep_until(from_s)
+    disk.fail_writes(errno.ENOSPC, round(from_s * 1e9), round(until_s * 1e9))
+    await mission.sleep_until(until_s)
+    disk.write_error = None
+
+
 @pytest.mark.slow
 def test_edited_pose_rate_is_in_force_from_the_restart_on(tmp_path: Path) -> None:
     """The recording states it, the poses follow it, and the recording after it is taken back has the old one."""
@@ -130,13 +139,10 @@ def test_master_that_resumes_on_a_full_disk_leaves_a_recording_that_ends_early(t
     """What it published before it was suspended waits for the disk, and is lost with its run; measurements are delivered again."""
 
     async def suspend(mission: Mission) -> None:
-        await mission.sleep_until(9.5)
-        disk = mission.computers[MASTER].disk
-        disk.fail_writes(errno.ENOSPC, 9_500_000_000, 24_000_000_000)
-        await mission.sleep_until(10.0)
-        await mission.suspend_master(8.0)
-        await mission.sleep_until(24.0)
-        disk.write_error = None
+        async with asyncio.TaskGroup() as group:
+            group.create_task(_fill_disk(mission, 9.5, 24.0))
+            await mission.sleep_until(10.0)
+            await mission.suspend_master(8.0)
 
     result = run_linear_drive(tmp_path, suspend, 44.0, faults=frozenset({FaultKind.MASTER_SUSPEND}))
     before, after = result.master_logs
@@ -150,16 +156,8 @@ def test_master_that_resumes_on_a_full_disk_leaves_a_recording_that_ends_early(t
 @pytest.mark.slow
 def test_disk_that_is_full_for_longer_than_lines_can_wait(tmp_path: Path) -> None:
     """Lines are lost, poses among them; measurements are delivered again, so that each is in the recording once."""
-
-    async def fill(mission: Mission) -> None:
-        await mission.sleep_until(6.0)
-        disk = mission.computers[MASTER].disk
-        disk.fail_writes(errno.ENOSPC, 6_000_000_000, 20_000_000_000)
-        await mission.sleep_until(20.0)
-        disk.write_error = None
-
     with patch("tsgt.master.daemon.Recorder", partial(Recorder, max_pending_lines=150)):
-        result = run_linear_drive(tmp_path, fill, 36.0)
+        result = run_linear_drive(tmp_path, lambda mission: _fill_disk(mission, 6.0, 20.0), 36.0)
     (log,) = result.master_logs
     status, path = log.statuses[-1].recording, log.recording()
     assert status is not None

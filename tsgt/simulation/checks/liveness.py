@@ -99,7 +99,8 @@ def pose_share(protocol: str, *, stations: int, knocked: bool, contradicted: boo
     """Minimum share of valid poses.
 
     An IMU that was knocked is set up wrongly for good. Fewer than three stations have no poses without it. A station with late stamps,
-    or on another prism, contradicts the IMU as one that has moved, also for good, or as one whose set-up is wrong: ``contradicted``.
+    or on another prism or with its number, contradicts the IMU as one that has moved, also for good, or as one whose set-up is wrong:
+    ``contradicted``.
     """
     return 0.0 if (knocked or contradicted) and stations < MIN_PRISMS else MIN_VALID_SHARE[protocol]
 
@@ -107,9 +108,9 @@ def pose_share(protocol: str, *, stations: int, knocked: bool, contradicted: boo
 def contradicted_by_station(
     result: MissionResult, master_log: MasterLog, indices: Mapping[int, JournalIndex], from_s: float
 ) -> bool:
-    """Whether measurements are said to contradict the IMU for what a station did: its stamps were late, or it followed another prism.
+    """Whether measurements are said to contradict the IMU for what a station did.
 
-    The set-up of the IMU is not checked again before new measurements suffice for that.
+    Its stamps were late, or it followed another prism or had another's number in its configuration. The set-up of the IMU is not checked again before new measurements suffice for that.
     """
     prisms = {station.station: station.prism for station in result.parameters.stations}
 
@@ -118,7 +119,12 @@ def contradicted_by_station(
             follows_another(index.station_log, prisms[number], at_s, before_s)
             for number, index in indices.items()
         )
-        return stamps_are_late(indices.values(), at_s) or any(others)
+        renumbered = (
+            m.prism != prisms[m.station]
+            and at_s - before_s <= (m.stamp_ns - master_log.unix_at_zero_ns) / 1e9 <= at_s
+            for m in master_log.measurements
+        )
+        return stamps_are_late(indices.values(), at_s) or any(others) or any(renumbered)
 
     setup_wrong = False
     for event in master_log.events:

@@ -52,6 +52,22 @@ def test_event_that_a_station_on_another_prism_has_caused_is_known(
     master_log: Any = SimpleNamespace(
         unix_at_zero_ns=5,
         events=[SimpleNamespace(event=name, stamp_ns=5 + at_s * 1_000_000_000) for name, at_s in events],
+        measurements=[],
     )
     index: Any = SimpleNamespace(station_log=log, journalled_by_start=[])
+    assert contradicted_by_station(result, master_log, {1: index}, 90.0) is expected
+
+
+@pytest.mark.parametrize(("prism", "at_s", "expected"), [(2, 50, True), (2, 70, False), (1, 50, False)])
+def test_event_that_another_prism_number_has_caused_is_known(
+    prism: int, at_s: int, *, expected: bool
+) -> None:
+    """The station follows its prism, and its client gives the measurements another number, at 10 s."""
+    result: Any = SimpleNamespace(parameters=SimpleNamespace(stations=[SimpleNamespace(station=1, prism=1)]))
+    master_log: Any = SimpleNamespace(
+        unix_at_zero_ns=5,
+        events=[SimpleNamespace(event="imu_setup_wrong", stamp_ns=5 + at_s * 1_000_000_000)],
+        measurements=[SimpleNamespace(station=1, prism=prism, stamp_ns=10_000_000_005)],
+    )
+    index: Any = SimpleNamespace(station_log=StationLog(station=1, folder=None), journalled_by_start=[])
     assert contradicted_by_station(result, master_log, {1: index}, 90.0) is expected

@@ -173,10 +173,10 @@ def distribution_failures(
 def max_median_rotation_rad(parameters: Parameters) -> float:
     """Limit of the median rotation error.
 
-    A single prism tells the heading by accelerations alone, along axes of the accelerometer that are not at right angles and
-    stay so: that is no noise, and no median removes it.
+    Accelerations alone tell the heading with a single prism, and the rotation about the line of two, along axes of the accelerometer
+    that are not at right angles and stay so: that is no noise, and no median removes it.
     """
-    if parameters.imu is None or len(parameters.prisms) > 1:
+    if parameters.imu is None or len(parameters.prisms) >= MIN_PRISMS:
         return MAX_MEDIAN_ERROR
     return MAX_MEDIAN_ERROR + MISALIGNMENT_SIGMAS * parameters.imu.noise.accelerometer_scale_misalignment
 

@@ -18,6 +18,9 @@ MAX_ENTRIES = 500
 MAX_IMU_LINES = 3000
 """Lines of 50 s, and as many again that were held back and arrive at once."""
 
+MAX_IMU_MEASUREMENTS = 1500
+"""Of 50 s: three stations that deliver a backlog of a minute send 25 a second (docs/explanation/superframe.md)."""
+
 STATED_BOUNDS = {
     ("_Reader", "_queue"): QUEUE_LINES,
     ("StationIngest", "_known"): DUPLICATE_WINDOW,
@@ -28,6 +31,7 @@ STATED_BOUNDS = {
     ("Backlog", "queued"): QUEUE_CAPACITY,
     ("Backlog", "receptions"): MAX_RECEPTIONS,
     ("ImuSetupMonitor", "_records"): MAX_IMU_LINES,
+    ("ImuSetupMonitor", "_measurements"): MAX_IMU_MEASUREMENTS,
     ("ImuSelector", "_records"): MAX_IMU_LINES,
     **dict.fromkeys(
         (("ClockSegment", name) for name in ("_forward", "_samples", "_received_ns")), MAX_SAMPLES

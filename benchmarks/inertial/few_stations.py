@@ -187,6 +187,8 @@ def main() -> None:
             )
             if name != "none":
                 observations = with_fault(mission, observations, station, fault)
+            # Station k follows prism k; a set-up has no other ones than its stations follow.
+            observations = replace(observations, layout=observations.layout[:stations])
             print(row_of(name, stations, smoothed_errors(mission, observations)), flush=True)
 
 

@@ -242,7 +242,7 @@ class ImuSelector:
             # What the samples show by themselves passes; whatever else it was may have come to stay.
             uncertain = self._with.setup_uncertain or self._with.health is None
             if found == ImuUse.DISAGREES and uncertain and self._setup is not None:
-                self._setup.restart(shock=self._with.shock)
+                self._setup.restart()
             if self.use == ImuUse.USED:
                 again = now_s - self._used_from_s < PROVEN_S
                 # With fewer than three prisms there are no poses meanwhile.

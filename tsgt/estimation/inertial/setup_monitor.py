@@ -19,7 +19,13 @@ from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.geometry.batch import fit_trajectory, scale_noise
-from tsgt.geometry.inertial import Gravity, Mounting, fit_inertial_trajectory, usable_samples
+from tsgt.geometry.inertial import (
+    Gravity,
+    Mounting,
+    fit_inertial_trajectory,
+    judge_magnitudes,
+    usable_samples,
+)
 from tsgt.geometry.inertial_calibration import (
     MIN_CHECKED_MEASUREMENTS,
     SetupCheck,
@@ -195,13 +201,8 @@ class ImuSetupMonitor:
         events, self._events = self._events, []
         return events
 
-    def restart(self, *, shock: bool = False) -> None:
-        """Confirm the set-up again, from what comes from now on: it may have changed.
-
-        After a ``shock`` fewer than three prisms confirm nothing any more: they do not tell all rotations, and what they do not tell
-        is not as configured for certain.
-        """
-        self._displaced |= shock and len(self._parameters.prisms) < MIN_PRISMS
+    def restart(self) -> None:
+        """Confirm the set-up again, from what comes from now on: it may have changed."""
         self._measurements.clear()
         self._records.clear()
         self._next_ns = self._result = None
@@ -225,7 +226,17 @@ class ImuSetupMonitor:
             self._begin(now_ns)
 
     def samples(self, record: ImuSamples) -> None:
-        """Take samples of the IMU at their ``received_ns``."""
+        """Take samples of the IMU at their ``received_ns``; after a shock the set-up is confirmed again.
+
+        Fewer than three prisms confirm nothing any more then: they do not tell all rotations, and what they do not tell is not as
+        configured for certain. Here, because lines that come late, or before the first measurement, reach no trajectory.
+        """
+        _, shocks = judge_magnitudes(
+            np.array(record.angular_rate_radps), np.array(record.specific_force_mps2)
+        )
+        if shocks.any():
+            self._displaced |= len(self._parameters.prisms) < MIN_PRISMS
+            self.restart()
         self._records.append(record)
         while self._records[0].received_ns < record.received_ns - WINDOW_NS:
             self._records.popleft()

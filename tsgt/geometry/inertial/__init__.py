@@ -10,6 +10,7 @@ from tsgt.geometry.inertial.live import (
     DISAGREES_WITH_PRISMS,
     InertialFixedLagSmoother,
     SaturationMonitor,
+    judge_magnitudes,
     usable_samples,
 )
 from tsgt.geometry.inertial.odometry import WheelSamples, WheelsEstimate
@@ -57,6 +58,7 @@ __all__ = [
     "estimation_noise",
     "fit_inertial_trajectory",
     "inertial_knot_times",
+    "judge_magnitudes",
     "preintegrate",
     "search_heading",
     "solve_inertial",

@@ -52,7 +52,7 @@ class FakeInertialSmoother(FixedLagSmoother):
         self.saturation = saturation
         self.up_m = UP_M
         self.health: str | None = None
-        self.setup_uncertain = self.shock = False
+        self.setup_uncertain = False
         self.contradicted = False
         self.wheels: WheelsEstimate | None = None
         self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
@@ -293,11 +293,10 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace
         ambiguous=False,
         health=None,
         setup_uncertain=False,
-        shock=False,
         add_samples=lambda _: None,
     )
-    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="", shock=False)
-    setup.restart = lambda *, shock: vars(setup).update(confirmed=False, shock=shock)
+    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="")
+    setup.restart = lambda: vars(setup).update(confirmed=False)
 
     def create_with(min_prisms: int) -> Any:
         window.min_prisms = min_prisms
@@ -328,13 +327,11 @@ def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
     """After a shock, and where the prisms contradict, the IMU may have moved for good."""
     selector, window, setup = sound
     uses_of(selector, 0.0, 1.0)
-    window.health, window.shock = (fault if fault != "prisms" else None), fault == "shock"
-    window.setup_uncertain = window.shock
+    window.health, window.setup_uncertain = (fault if fault != "prisms" else None), fault == "shock"
     window.ambiguous = fault == "prisms"
     found = [uses_of(selector, 1.0, 1.6)[-1][0]]
     window.health, window.setup_uncertain, window.ambiguous = None, False, False
     found.append(uses_of(selector, 1.6, 7.0)[-1][0])
-    assert setup.shock == (fault == "shock")
     setup.confirmed = True
     found.append(uses_of(selector, 7.0, 7.1)[-1][0])
     assert found == [ImuUse.DISAGREES, use, ImuUse.USED]
@@ -442,7 +439,7 @@ def test_unconfirmed_imu_is_not_used_sooner_because_stations_had_none_long_ago(
     setup.confirmed = True
     uses_of(selector, 1.0, 30.0)
     cast("Any", selector._without).converged = False
-    window.health, window.setup_uncertain, window.shock = "a shock", True, True
+    window.health, window.setup_uncertain = "a shock", True
     uses_of(selector, 30.0, 30.1)
     window.health = None
     found = uses_of(selector, 30.1, 50.0)
@@ -504,7 +501,7 @@ def test_contradiction_of_one_or_two_stations_lasts(
     """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
-    window.setup_uncertain = window.shock = False
+    window.setup_uncertain = False
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=prisms)
     selector.begin(START)
     found = []
@@ -527,7 +524,7 @@ def test_trajectory_that_was_never_consistent_contradicts_no_station(
     """What a new start finds first may be wrong, and is bent towards the measurements."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
     window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
-    window.setup_uncertain = window.shock = False
+    window.setup_uncertain = False
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=2)
     selector.begin(START)
     for number in range(20):

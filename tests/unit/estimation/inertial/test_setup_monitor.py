@@ -45,6 +45,11 @@ def wrong(cause: Cause) -> SetupCheck:
     return SetupCheck((SetupFinding(cause, 0.02, 0.001, f"{cause} is wrong"),))
 
 
+def shock(samples: ImuSamples) -> ImuSamples:
+    """Return samples of which the last shows a knock: 90 m/s^2 along y."""
+    return replace(samples, specific_force_mps2=(*samples.specific_force_mps2[:-1], (0.0, 90.0, 9.8)))
+
+
 @dataclass
 class Monitored:
     """A monitor whose checks give prepared results, fed for some time once a second."""
@@ -115,7 +120,17 @@ def test_few_prisms_do_not_confirm_after_a_blow(prisms: int, *, confirmed: bool)
     monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
     monitored.run(18)
     assert monitored.monitor.confirmed
-    monitored.monitor.restart(shock=True)
+    monitored.monitor.samples(shock(monitored.samples))
+    assert not monitored.monitor.confirmed
+    monitored.run(18)
+    assert monitored.monitor.confirmed == confirmed
+
+
+@pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
+def test_few_prisms_do_not_confirm_after_a_blow_before_them(prisms: int, *, confirmed: bool) -> None:
+    """No measurement has come yet, so that no trajectory knows of the shock."""
+    monitored = Monitored([RIGHT], prisms=prisms)
+    monitored.monitor.samples(replace(shock(monitored.samples), received_ns=START - 10 * SECOND))
     monitored.run(18)
     assert monitored.monitor.confirmed == confirmed
 

@@ -181,11 +181,6 @@ class InertialFixedLagSmoother(MeasurementWindow):
         """Whether the mounting of the IMU may have changed: by a shock, or by whatever made the samples disagree with the prisms."""
         return self._health.setup_uncertain
 
-    @property
-    def shock(self) -> bool:
-        """Whether a shock may have displaced it."""
-        return self._health.shock
-
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""
         if not len(new):

@@ -54,6 +54,18 @@ def usable_samples(samples: InertialSamples, imu: ImuParameters) -> InertialSamp
     return samples.select(np.concatenate(parts)) if parts else samples
 
 
+def judge_magnitudes(
+    angular_rate_radps: FloatArray, specific_force_mps2: FloatArray
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which of N samples, (N, 3) each, are within any measuring range, and which of these show a shock."""
+    # NaN is below no limit.
+    largest_rates, largest_forces = (
+        np.maximum.reduce(np.abs(each), axis=1) for each in (angular_rate_radps, specific_force_mps2)
+    )
+    possible: NDArray[np.bool_] = (largest_rates < MAX_RATE_RADPS) & (largest_forces < MAX_FORCE_MPS2)
+    return possible, possible & (largest_forces > SHOCK_MPS2)
+
+
 class HealthMonitor:
     """Judges samples as they arrive, and innovations of the measurements; times on the time scale of the observations.
 
@@ -64,8 +76,7 @@ class HealthMonitor:
 
     ``saturation``: finds values at the limit of the device, and knows those limits that earlier monitors have met.
 
-    ``setup_uncertain``: the mounting may have changed, by a shock or whatever made the samples disagree with the prisms. ``shock``: by a
-    shock.
+    ``setup_uncertain``: the mounting may have changed, by a shock or whatever made the samples disagree with the prisms.
     """
 
     def __init__(self, imu: ImuParameters, saturation: SaturationMonitor | None = None) -> None:
@@ -74,7 +85,7 @@ class HealthMonitor:
         self._newest_s = -np.inf
         self._problem = ""
         self._problem_s = -np.inf
-        self.setup_uncertain = self.shock = False
+        self.setup_uncertain = False
         self._same_s = 0.0
         self.stuck_from_s = np.inf  # The values have not changed since, for too long
         self._innovations: deque[tuple[float, int, bool]] = deque()
@@ -95,17 +106,11 @@ class HealthMonitor:
 
     def samples(self, new: InertialSamples) -> NDArray[np.bool_]:
         """Judge samples in the order of time; return which, (N,), can be used but for those after :attr:`stuck_from_s`."""
-        # NaN is below no limit.
-        largest_rates, largest_forces = (
-            np.maximum.reduce(np.abs(each), axis=1)
-            for each in (new.angular_rate_radps, new.specific_force_mps2)
-        )
-        usable: NDArray[np.bool_] = (largest_rates < MAX_RATE_RADPS) & (largest_forces < MAX_FORCE_MPS2)
+        usable, shocks = judge_magnitudes(new.angular_rate_radps, new.specific_force_mps2)
         if not usable.all():
             self._report("values beyond any measuring range", float(new.end_s[~usable][-1]))
-        shocks: NDArray[np.bool_] = usable & (largest_forces > SHOCK_MPS2)
         if shocks.any():
-            self.setup_uncertain = self.shock = True
+            self.setup_uncertain = True
             self._report("a shock may have displaced it", float(new.end_s[shocks][-1]))
         unchanged, at_limit = self._saturation.samples(new)
         self._check_stuck(new, unchanged)

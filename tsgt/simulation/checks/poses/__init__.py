@@ -2,7 +2,8 @@
 
 In: a :class:`MissionResult` and the log of one master. Out: descriptions of violations. Against the truth: `consistency` (each pose),
 `covariance_scale`, `lateness`, `twists` (many); against the measurements: `ages`, `expected`; against the documentation: `rules`. Where
-stations have moved, `apparent` gives the poses that they show, and `layout_events` expects the layout monitor to say so.
+stations have moved, `apparent` gives the poses that they show, and `layout_events` expects the layout monitor to say so; `knocks` knows what a
+knock of the IMU adds where nothing tells it.
 """
 
 from tsgt.simulation.checks.poses.ages import age_failures

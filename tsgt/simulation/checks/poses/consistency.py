@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation import build_tracks, centroid_at_point, centroid_m, transform_of, usable
+from tsgt.estimation import build_tracks, centroid_at_point, transform_of, usable
 from tsgt.geometry import invert, log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.model import MIN_PRISMS
 from tsgt.simulation.checks.poses.apparent import apparent_poses, misfit_tolerances
+from tsgt.simulation.checks.poses.knocks import displaced_covariance, displacements, untold_displacements
 from tsgt.simulation.checks.poses.late_stamps import late_stamp_tolerances
-from tsgt.simulation.faults import KNOCK_DISPLACEMENT_M, KNOCK_ROTATION_RAD
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -107,35 +107,6 @@ def rolls_over_unseen(poses: ValidPoses, master_log: MasterLog, result: MissionR
     return found
 
 
-def untold_displacements(
-    poses: ValidPoses, master_log: MasterLog, result: MissionResult
-) -> NDArray[np.float64]:
-    """By what the IMU has been knocked before each pose that prisms do not tell: in m at their centroid and in rad, (N, 2).
-
-    A single prism tells no rotation of the IMU on the robot, and two none about their line: the poses are turned by it
-    (docs/how-to/one-or-two-stations.md). A displacement is named from 50 mm on. A master that was started after the knock, or had
-    no samples of it, cannot know.
-    """
-    parameters = result.parameters
-    if parameters.imu is None or len(parameters.prisms) >= MIN_PRISMS:
-        return np.zeros((len(poses.stamp_ns), 2))
-    at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
-    lever_m = float(np.linalg.norm(np.array(parameters.imu.position_m) - centroid_m(parameters)))
-    each = np.array([KNOCK_DISPLACEMENT_M + lever_m * KNOCK_ROTATION_RAD, KNOCK_ROTATION_RAD])
-    knocks = np.searchsorted(np.sort(result.knocks_s), at_s).astype(np.float64)
-    displaced: NDArray[np.float64] = knocks[:, None] * each
-    return displaced
-
-
-def displaced_covariance(
-    covariance: NDArray[np.float64], untold: NDArray[np.float64], parameters: Parameters
-) -> NDArray[np.float64]:
-    """Add to covariances, (N, 6, 6), what :func:`untold_displacements` gives: the error of a long prediction is far larger than that."""
-    arm_m = float(np.linalg.norm(centroid_at_point(parameters)))
-    sigmas = np.stack([untold[:, 0] + arm_m * untold[:, 1], untold[:, 1]], axis=1).repeat(3, axis=1)
-    return np.asarray(covariance + sigmas[:, None] ** 2 * np.eye(6))
-
-
 def distribution_failures(
     master_log: MasterLog, result: MissionResult, indices: Mapping[int, JournalIndex]
 ) -> Iterator[str]:
@@ -148,7 +119,7 @@ def distribution_failures(
     if any(station_log.folder is None for station_log in result.station_logs.values()):
         return
     every = master_log.valid_poses()
-    told = untold_displacements(every, master_log, result)[:, 1] == 0.0
+    told = displacements(every, master_log, result)[:, 1] == 0.0
     told &= _errors(every, master_log, result)[2][:, 0] <= MAX_MISFIT_M
     every_s = (every.stamp_ns - master_log.unix_at_zero_ns) / 1e9
     told &= late_stamp_tolerances(result, indices.values(), every_s)[:, 0] == 0.0

@@ -195,8 +195,8 @@ class PoseRecord(FiniteNumbers):
     """Whether the pose rests on the robot's IMU: ``used``; ``starting``: not yet, or not again, since its trajectory is not
     certain enough; ``silent``: no sample for 0.3 s; ``disagrees``: with the measurements of the prisms;
     ``wrong_setup``: a drive has shown that its mounting, latency, axes or units are wrong; ``unconfirmed``: no drive has
-    shown yet that they are right, since the master started. Poses without it
-    are those of an estimator without IMU. The key is missing where no IMU is configured."""
+    shown that they are right since the start, the last set-up, shock or disagreement. With one or two stations such an IMU is
+    ``used``, and ``degraded_by`` has ``imu_unconfirmed``. Poses without it are those of an estimator without IMU. The key is missing where no IMU is configured."""
     jump_m: float | None = None
     """Of a predicted pose with an IMU configured that is the first after measurements were added, or after the use of the
     IMU changed: distance in m from the position that would have been predicted before. The key is missing in all other
@@ -215,8 +215,8 @@ class PoseRecord(FiniteNumbers):
     """``good``; ``degraded``: valid, but with less reserve, see ``degraded_by``; ``invalid``: not ``valid``. Null in
     recordings of older versions."""
     degraded_by: tuple[Degradation, ...] = ()
-    """What degrades a valid pose: ``prism_missing`` (fewer than three prisms are measured), ``old_measurements`` (a
-    prediction whose newest measurement is older than three quarters of the outage limit), ``uncertain`` (a sigma is
+    """What degrades a valid pose: ``prism_missing`` (fewer than three prisms, or not all of one or two, are
+    measured), ``old_measurements`` (a prediction whose newest measurement is older than three quarters of the outage limit), ``uncertain`` (a sigma is
     above half its limit), ``ambiguous`` (measurements contradicted each other up to 1.5 s before), ``residual``
     (``residual_m`` is above half its limit), ``imu_unconfirmed`` (it rests on an IMU whose set-up no drive has confirmed yet;
     the covariance allows for that)."""

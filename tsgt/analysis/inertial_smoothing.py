@@ -10,7 +10,7 @@ import numpy as np
 from tsgt.errors import GeometryError
 from tsgt.estimation import InertialSetupUncertainty, centroid_m, inertial_samples, wheel_samples
 from tsgt.geometry.batch import overall_scale, scale_noise
-from tsgt.geometry.inertial import fit_inertial_trajectory
+from tsgt.geometry.inertial import fit_inertial_trajectory, judge_magnitudes, usable_samples
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -36,6 +36,10 @@ MAX_CONTRADICTED = 0.5  # Share of the windows beyond which the IMU is not used 
 MAX_BIAS_SIGMAS = 8.0
 """Bias in sigmas of the data sheet. A mounting that is off by an angle passes for a bias of this angle times gravity."""
 
+SHOCK_REMEDY = (
+    "poses are degraded from then on, and their covariance allows for a turn by a degree; calibrate it again"
+)
+
 NOISE_SCALE_PRIOR = 30.0
 """Components as many as the prior on a factor on the noise is worth; the factor 1 is that of the data sheet."""
 
@@ -59,6 +63,9 @@ class ImuUse:
     noise_scales: FloatArray  # (S + 1, 3) factors on the stated noise of the measurements
     noise_scale: float  # Their root mean square over all measurements and components
     unused: tuple[UnusedInterval, ...]
+    displaced_from_s: float = (
+        np.inf
+    )  # When a shock may have displaced it, which fewer than three prisms do not tell
     odometry_samples: int = 0  # Of the wheel odometry that was used with it
 
     def unused_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
@@ -83,16 +90,18 @@ def fit_with_imu(
     origin_ns: int,
     noise_scales: FloatArray,
     tuned: bool,
+    few_prisms: bool,
     on_progress: Callable[[float], None] | None = None,
 ) -> ImuUse:
     """Fit a trajectory to observations, with their stated noise, and to the samples of the IMU.
 
-    ``noise_scales``: factors on the noise, (S + 1, 3); unless ``tuned`` they are estimated here. Raises GeometryError: the
-    samples do not belong to the measurements or contradict them, or no trajectory fits.
+    ``noise_scales``: factors on the noise, (S + 1, 3); unless ``tuned`` they are estimated here. ``few_prisms``: fewer than three
+    were measured. Raises GeometryError: the samples do not belong to the measurements or contradict them, or no trajectory fits.
     """
     imu = parameters.imu
     assert imu is not None  # noqa: S101 (the caller checks)
-    samples = inertial_samples(records, imu, origin_ns)
+    recorded = inertial_samples(records, imu, origin_ns)
+    samples = usable_samples(recorded, imu)
     start_s, end_s = float(observations.time_s[0]), float(observations.time_s[-1])
     if not len(samples) or samples.end_s[-1] < start_s or samples.end_s[0] > end_s:
         raise GeometryError(
@@ -138,8 +147,15 @@ def fit_with_imu(
         noise_scales,
         overall_scale(observations, noise_scales),
         (*gaps(samples, start_s, end_s), *contradicted),
+        first_shock_s(recorded) if few_prisms else np.inf,
         0 if wheels is None else len(wheels[0]),
     )
+
+
+def first_shock_s(samples: InertialSamples) -> float:
+    """Return when the first shock was measured; infinite: there was none."""
+    _, shocks = judge_magnitudes(samples.angular_rate_radps, samples.specific_force_mps2)
+    return float(samples.end_s[shocks][0]) if shocks.any() else np.inf
 
 
 def _check_biases(fit: InertialFit, noise: ImuNoise) -> None:
@@ -208,6 +224,7 @@ def imu_keys(used: ImuUse | None, problem: str) -> dict[str, Any]:
             "stations": list(used.stations),
             "samples": len(used.samples),
             "unused_s": used.unused_s,
+            **({"displaced_from_s": used.displaced_from_s} if np.isfinite(used.displaced_from_s) else {}),
             **({"odometry_samples": used.odometry_samples} if used.odometry_samples else {}),
             "tilt_sigma_mrad": 1e3 * used.fit.tilt_sigma_rad,
         }

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation import ContinuousPoseOutput, MeasurementHistory, PoseBatch, measured_at_ns, usable
+from tsgt.estimation import (
+    UNCONFIRMED_SIGMAS,
+    ContinuousPoseOutput,
+    Degradation,
+    MeasurementHistory,
+    PoseBatch,
+    measured_at_ns,
+    usable,
+)
 from tsgt.geometry.trajectory import POSE_DIM
 
 if TYPE_CHECKING:
@@ -58,16 +66,22 @@ class PoseSeries:
         self._epochs_ns = np.arange(first, last + 1, dtype=np.int64) * period_ns
 
     def with_imu(self, imu: ImuUse, without: PoseBatch | None) -> PoseBatch:
-        """Return poses with an IMU; where it is not to be used those without it, or invalid ones."""
+        """Return poses with an IMU; where it is not to be used those without it, or invalid ones.
+
+        Where a shock may have displaced it they are degraded, and their covariance allows for that, as live.
+        """
         seen = self._history(imu.fit.residuals_m)
 
         def chunk(epochs_ns: NDArray[np.int64]) -> PoseBatch:
             time_s = self._time_s(epochs_ns)
             states, covariance, common = imu.fit.trajectory.poses_at(time_s)
-            converged = ~imu.unused_at(time_s)
-            return self._output.smoothed(
-                epochs_ns, seen, states, covariance, common=common, converged=converged
+            displaced = time_s > imu.displaced_from_s
+            covariance[displaced] += np.diag(UNCONFIRMED_SIGMAS**2)
+            batch = self._output.smoothed(
+                epochs_ns, seen, states, covariance, common=common, converged=~imu.unused_at(time_s)
             )
+            batch.degraded[displaced & batch.valid] |= Degradation.IMU_UNCONFIRMED
+            return batch
 
         poses = PoseBatch.collected(len(self._epochs_ns), map(chunk, _chunks(self._epochs_ns)))
         if without is None:

@@ -53,8 +53,6 @@ if TYPE_CHECKING:
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
 
-TWO_PRISMS = 2  # Measured for a minute they tell what a single prism does not: the rotation of the IMU, but about their line
-
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
@@ -258,7 +256,7 @@ def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -
         return None, ""
     if not recording.imu_samples:
         return None, "the recording has no IMU samples; give --imu, a file of tsgt import imu, or --no-imu"
-    if prepared.complete or len(parameters.prisms) == TWO_PRISMS:
+    if prepared.complete or len(parameters.prisms) < MIN_PRISMS:
         problem = wrong_imu_setup(parameters, prepared.measurements, recording.imu_samples)
         if problem and not prepared.complete:
             raise RecordingError(
@@ -276,6 +274,7 @@ def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -
             origin_ns=prepared.origin_ns,
             noise_scales=prepared.motion.noise_scales,
             tuned=prepared.motion.tuned,
+            few_prisms=not prepared.complete,
             on_progress=on_progress,
         )
     except GeometryError as error:

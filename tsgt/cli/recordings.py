@@ -11,6 +11,7 @@ import click
 import numpy as np
 
 import tsgt
+from tsgt.analysis.inertial_smoothing import SHOCK_REMEDY
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.refinement import Refine
@@ -277,6 +278,8 @@ def imu_text(found: SmoothedPoses) -> str | None:
     ):
         seconds = sum(each.end_s - each.start_s for each in used.unused if each.reason == reason)
         text += f"; {seconds:.1f} s {words}" if seconds else ""
+    if np.isfinite(used.displaced_from_s):
+        text += f"; from {used.displaced_from_s:.1f} s on a shock may have displaced it: {SHOCK_REMEDY}"
     return text
 
 

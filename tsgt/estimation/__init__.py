@@ -7,6 +7,7 @@ hold and validate poses; `reference_point` carries them to another point of the 
 """
 
 from tsgt.estimation.inertial import (
+    UNCONFIRMED_SIGMAS,
     ImuSetupMonitor,
     OdometryState,
     SampleConverter,
@@ -56,6 +57,7 @@ from tsgt.estimation.tracks import (
 __all__ = [
     "MAX_DISTANCE_M",
     "POINT_COMMENT",
+    "UNCONFIRMED_SIGMAS",
     "ContinuousPoseOutput",
     "Degradation",
     "ImuSetupMonitor",

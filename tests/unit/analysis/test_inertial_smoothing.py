@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.errors import DegenerateGeometryError, RecordingError
-from tsgt.estimation import named_point
+from tsgt.estimation import Degradation, named_point
 from tsgt.model import SetupCovariance
 
 if TYPE_CHECKING:
@@ -125,3 +125,45 @@ def test_poses_of_the_imu_are_those_of_its_frame() -> None:
     expected = position + rotation @ np.array(IMU.position_m)
     error_m = np.linalg.norm(found.position_m - expected, axis=1)[MARGIN:-MARGIN]
     assert 1e3 * np.sqrt((error_m**2).mean()) < 2.0
+
+
+@pytest.mark.parametrize(("stations", "displaced"), [(3, False), (1, True)])
+def test_poses_of_one_station_allow_for_a_shock_before_them(stations: int, *, displaced: bool) -> None:
+    """It may have turned the IMU, which a single prism does not tell."""
+    recording = imu_recording(DRIVE, stations=stations)
+    shock = [
+        replace(each, specific_force_mps2=((0.0, 90.0, 9.8), *each.specific_force_mps2[1:]))
+        if 0 <= each.stamp_ns[0] - START - 14 * 10**9 < each.stamp_ns[-1] - each.stamp_ns[0]
+        else each
+        for each in recording.imu_samples
+    ]
+    found = smooth(replace(recording, imu_samples=shock)).poses
+    after = found.valid & (found.stamp_ns > START + 15 * 10**9)
+    before = found.valid & (found.stamp_ns < START + 14 * 10**9)
+    unconfirmed = (found.degraded & Degradation.IMU_UNCONFIRMED) != 0
+    assert after.sum() > 100
+    assert not unconfirmed[before].any()
+    assert (unconfirmed[after] == displaced).all()
+    sigmas = np.sqrt(found.covariance[:, [3, 4, 5], [3, 4, 5]])
+    assert (sigmas[after].min() > np.radians(0.5)) == displaced
+
+
+def test_clipped_samples_are_left_out() -> None:
+    """The device measures up to 12 m/s^2, which bumps exceed: as exact as the gaps allow, and no pose is missing."""
+    recording = imu_recording(DRIVE, stations=1)
+    clipped = [
+        replace(each, specific_force_mps2=tuple((x, y, min(z, 12.0)) for x, y, z in each.specific_force_mps2))
+        for each in recording.imu_samples
+    ]
+    found = smooth(replace(recording, imu_samples=clipped))
+    assert found.imu is not None
+    assert len(found.imu.samples) < 26 * 200 - 50
+    assert found.poses.valid[MARGIN:-MARGIN].all()
+    assert 1e3 * np.sqrt((position_errors_m(found) ** 2).mean()) < 6.0
+
+
+def test_wrong_latency_of_the_imu_is_an_error_of_one_station() -> None:
+    """A single prism tells it."""
+    imu = replace(IMU, latency_ns=IMU.latency_ns + 40_000_000)
+    with pytest.raises(RecordingError, match=r"latency of the IMU is wrong.*--imu-setup"):
+        smooth(imu_recording(shaken_drive(60.0), stations=1, imu=imu))

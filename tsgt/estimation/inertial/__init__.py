@@ -6,6 +6,7 @@ contradicted while the robot drives (`setup_monitor`), and the trajectory with o
 
 from tsgt.estimation.inertial.samples import SampleConverter, inertial_samples
 from tsgt.estimation.inertial.selection import (
+    UNCONFIRMED_SIGMAS,
     ImuState,
     OdometryState,
 )
@@ -18,6 +19,7 @@ from tsgt.estimation.inertial.setup_monitor import (
 from tsgt.estimation.inertial.wheels import wheel_samples
 
 __all__ = [
+    "UNCONFIRMED_SIGMAS",
     "ImuSetupMonitor",
     "ImuState",
     "OdometryState",

@@ -235,12 +235,11 @@ class ImuSelector:
             self._next_comparison_s = now_s + COMPARISON_INTERVAL_S
             self._compare(now_s)
         found = self._found(now_s)
-        if self._prisms < MIN_PRISMS:
-            self._watch_stations(found)
+        self._watch_stations(found)
         if found in _REJECTED_USES:
             self._disagreement = self._untrusted or self._contradiction
             # What the samples show by themselves passes; whatever else it was may have come to stay.
-            uncertain = self._with.setup_uncertain or self._with.health is None
+            uncertain = bool(self._with.setup_doubt) or self._with.health is None
             if found == ImuUse.DISAGREES and uncertain and self._setup is not None:
                 self._setup.restart()
             if self.use == ImuUse.USED:
@@ -278,11 +277,16 @@ class ImuSelector:
         """Note whether measurements of one or two prisms contradicted the IMU, and are followed from then on.
 
         A wrong one among right ones is an outlier, which is not followed. One alone that is followed is within what is possible: a
-        station that has moved contradicts with the next one too. A trajectory that was never consistent may itself be wrong.
+        station that has moved contradicts with the next one too. A trajectory that was never consistent may itself be wrong. With a
+        single prism a trajectory that is lost in a contradiction, or given up for another fault, starts again where the station then is.
+        Three stations of which fewer are measured are no better, until the trajectory without IMU tells.
         """
-        rejected = (
-            self._prisms == 1 and found == ImuUse.DISAGREES and DISAGREES_WITH_PRISMS in self._contradiction
-        )
+        disagrees = found == ImuUse.DISAGREES
+        rejected = disagrees and DISAGREES_WITH_PRISMS in self._contradiction
+        if self._was_consistent:
+            rejected |= self._with.lost_after_s > _SIMULTANEOUS_S
+            rejected |= disagrees and self._with.beyond_chance
+        rejected &= self._prisms == 1
         followed = False
         if not self._with.converged:
             self._was_consistent = self._was_ambiguous = False
@@ -292,7 +296,10 @@ class ImuSelector:
             # One in a thousand is inconsistent by chance, and no other.
             followed = self._was_ambiguous and self._with.followed_for_s > _SIMULTANEOUS_S
             self._was_consistent, self._was_ambiguous = True, False
-        self.station_contradicted |= self._established and (followed or rejected)
+        if self._with.measured_prisms < MIN_PRISMS:
+            self.station_contradicted |= self._established and (followed or rejected)
+        elif self._without.converged:
+            self.station_contradicted = False
         self._established |= self._with.converged and not self._with.ambiguous
 
     @property
@@ -302,7 +309,8 @@ class ImuSelector:
     def _found(self, now_s: float) -> ImuUse:
         if self._untrusted is not None:
             return ImuUse.WRONG_SETUP
-        if now_s - self._newest_s > SILENCE_S:
+        # What the samples showed before they ended counts, too.
+        if now_s - self._newest_s > SILENCE_S and not self._with.setup_doubt:
             return ImuUse.SILENT if np.isfinite(self._newest_s) else ImuUse.STARTING
         if self._contradicted(now_s):
             return ImuUse.DISAGREES
@@ -324,7 +332,7 @@ class ImuSelector:
 
     def _contradicted(self, now_s: float) -> bool:
         """Whether the IMU is rejected, or the trajectory with it has diverged while the one without has converged."""
-        self._contradiction = self._contradiction or self._with.health or ""
+        self._contradiction = self._contradiction or self._with.setup_doubt or self._with.health or ""
         if self._contradiction:
             return True
         if self.use != ImuUse.USED or (self._with.converged and not self._with.ambiguous):

@@ -40,8 +40,9 @@ class InnovationMonitor:
     from the first to the last inconsistent measurement of one prism in the newest ambiguity that the trajectory follows, once it is
     resolved. One that is inconsistent by chance bends the trajectory, so that one of another prism may follow; and several of one
     prism share the error of one prediction, so that one of them, followed or not, must be beyond :data:`NOT_BY_CHANCE_NIS`. The only
-    prism of a layout is followed even if all of its inconsistent measurements stay outliers, unless they are of a wrong prism: within
-    two seconds biases and tilt let a trajectory move by some centimetres unnoticed.
+    prism of a layout is followed even if all of its inconsistent measurements stay outliers, unless they are of a wrong prism:
+    within two seconds biases and tilt let a trajectory move by some centimetres unnoticed. ``lost_after_s``: the same time of the
+    ambiguity in which the trajectory was lost, followed or not, until one is resolved again.
     After an outage the state may be ambiguous though all is consistent (:meth:`set_unproven`).
     """
 
@@ -58,8 +59,19 @@ class InnovationMonitor:
         # Of the current ambiguity, by prism: first and last followed measurement that has left the window, and largest NIS
         self._spans_s: dict[int, tuple[float, float]] = {}
         self._largest_nis: dict[int, float] = {}
+        self._inconsistent_s: dict[int, tuple[float, float]] = {}  # First and last one, followed or not
         self._ambiguous_intervals_s: list[tuple[float, float]] = []
-        self.followed_for_s = 0.0
+        self.followed_for_s = self.lost_after_s = 0.0
+
+    @property
+    def measured_prisms(self) -> int:
+        """Number of prisms with measurements in the window."""
+        return len(np.unique(self._prism))
+
+    @property
+    def beyond_chance(self) -> bool:
+        """Whether a measurement in the current ambiguity is beyond :data:`NOT_BY_CHANCE_NIS`."""
+        return any(nis > NOT_BY_CHANCE_NIS for nis in self._largest_nis.values())
 
     @property
     def ambiguous_from_s(self) -> float:
@@ -85,7 +97,9 @@ class InnovationMonitor:
         self._consistent_prisms = frozenset()
         self._succession = 0
         self._spans_s.clear()
+        self.lost_after_s = max(self.lost_after_s, self._longest_s(self._inconsistent_s))
         self._largest_nis.clear()
+        self._inconsistent_s.clear()
         self.followed_for_s = 0.0
 
     def set_start(self, time_s: float, *, needs_two_prisms: bool = False) -> None:
@@ -109,7 +123,7 @@ class InnovationMonitor:
 
     def select(self, rows: NDArray[np.bool_]) -> None:
         """Drop the other measurements of the window."""
-        self._extend_spans(self._followed & ~rows)
+        self._extend(self._spans_s, self._followed & ~rows)
         self._flagged, self._followed = self._flagged[rows], self._followed[rows]
         self._time_s, self._prism = self._time_s[rows], self._prism[rows]
 
@@ -136,9 +150,9 @@ class InnovationMonitor:
         # Measurements that arrive together may each pass the gate and yet be mutually inconsistent.
         flagged[is_new] = (new_nis > OUTLIER_THRESHOLD**2) | outliers[is_new]
         self._flagged, self._followed = flagged, flagged & ~outliers
+        self._time_s, self._prism = observations.time_s, observations.prism
         if len(observations.layout) == 1:
             self._followed = flagged & (np.linalg.norm(residuals_m, axis=1) < OWN_PRISM_M)
-        self._time_s, self._prism = observations.time_s, observations.prism
         rows = (
             observations.time_s[is_new].tolist(),
             observations.prism[is_new].tolist(),
@@ -165,10 +179,14 @@ class InnovationMonitor:
         if followed:
             self.inconsistent_prisms |= followed
             self._consistent_prisms = frozenset()
-        if not self.inconsistent_prisms:
+        if self.inconsistent_prisms:
+            self._extend(self._inconsistent_s, flagged & is_new)
+        else:
             if flagged.any() or self._spans_s:
                 self._resolve()
             self._largest_nis.clear()
+            self._inconsistent_s.clear()
+            self.lost_after_s = 0.0
 
     def _resolve(self) -> None:
         """Record the interval of an ambiguity that has just ended, unless its flagged measurements were rejected."""
@@ -177,19 +195,23 @@ class InnovationMonitor:
         if self._followed.any() or (flagged.any() and not single_prism):
             times_s = self._time_s[flagged]
             self._ambiguous_intervals_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
-            self._extend_spans(self._followed)
-        self.followed_for_s = max(
+            self._extend(self._spans_s, self._followed)
+        self.followed_for_s = self._longest_s(self._spans_s)
+        self._flagged = self._followed = np.zeros_like(flagged)
+        self._spans_s.clear()
+
+    def _extend(self, spans_s: dict[int, tuple[float, float]], rows: NDArray[np.bool_]) -> None:
+        for prism, time_s in zip(self._prism[rows].tolist(), self._time_s[rows].tolist(), strict=True):
+            first_s, last_s = spans_s.get(prism, (time_s, time_s))
+            spans_s[prism] = min(first_s, time_s), max(last_s, time_s)
+
+    def _longest_s(self, spans_s: dict[int, tuple[float, float]]) -> float:
+        """Return the longest span of a prism one of whose measurements is beyond chance."""
+        return max(
             (
                 last_s - first_s
-                for prism, (first_s, last_s) in self._spans_s.items()
+                for prism, (first_s, last_s) in spans_s.items()
                 if self._largest_nis.get(prism, 0.0) > NOT_BY_CHANCE_NIS
             ),
             default=0.0,
         )
-        self._flagged = self._followed = np.zeros_like(flagged)
-        self._spans_s.clear()
-
-    def _extend_spans(self, rows: NDArray[np.bool_]) -> None:
-        for prism, time_s in zip(self._prism[rows].tolist(), self._time_s[rows].tolist(), strict=True):
-            first_s, last_s = self._spans_s.get(prism, (time_s, time_s))
-            self._spans_s[prism] = min(first_s, time_s), max(last_s, time_s)

@@ -116,6 +116,21 @@ class MeasurementWindow(ABC):
         """Time over which the trajectory has followed inconsistent measurements, once they are consistent; see :class:`InnovationMonitor`."""
         return self._monitor.followed_for_s
 
+    @property
+    def lost_after_s(self) -> float:
+        """Time over which measurements of one prism were inconsistent when the trajectory was lost, until there is a consistent one again."""
+        return self._monitor.lost_after_s
+
+    @property
+    def beyond_chance(self) -> bool:
+        """Whether a measurement in the current ambiguity is inconsistent beyond chance."""
+        return self._monitor.beyond_chance
+
+    @property
+    def measured_prisms(self) -> int:
+        """Number of prisms with measurements in the window."""
+        return self._monitor.measured_prisms
+
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
         held, self.observations = self.observations, merge_observations(self.observations, new)

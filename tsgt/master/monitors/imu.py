@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.master.publisher import Observer
+from tsgt.model import MIN_PRISMS
 from tsgt.recording import EventRecord
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ class ImuUseMonitor(Observer):
         if record.reason == "contradicted" and not self._contradicted:
             self._contradicted = True
             events.append(_contradiction([each.id for each in record.stations], now_ns))
+        # With three stations they are valid again once the prisms check each other.
+        self._contradicted &= not record.valid
         if record.imu != self._use:
             # While it is not used its cause may change; there is one event, and one when it is used again. There is none
             # for the first seconds, but for an IMU that is not used until the robot drives.
@@ -102,13 +105,17 @@ class OdometryUseMonitor(Observer):
 
 
 def _contradiction(stations: list[int], now_ns: int) -> EventRecord:
-    if len(stations) == 1:
+    until = "the master is restarted or takes a new set-up"
+    if len(stations) >= MIN_PRISMS:
+        until = "all three are measured again"
+        measured, whose = "those stations that still measure", "a tripod or prism"
+    elif len(stations) == 1:
         measured, whose = f"station {stations[0]}", "its tripod or prism"
     else:
         measured, whose = f"stations {' and '.join(map(str, stations))}", "a tripod or prism"
     message = (
         f"measurements of {measured} contradicted the IMU and then stayed at the new position: {whose} may have moved; "
-        "poses are invalid until the master is restarted or takes a new set-up. Check the stations first: tsgt calibrate check"
+        f"poses are invalid until {until}. Check the stations first: tsgt calibrate check"
     )
     station = stations[0] if len(stations) == 1 else None
     return EventRecord(stamp_ns=now_ns, event="station_contradicted", message=message, station=station)

@@ -52,7 +52,7 @@ class FakeInertialSmoother(FixedLagSmoother):
         self.saturation = saturation
         self.up_m = UP_M
         self.health: str | None = None
-        self.setup_uncertain = False
+        self.setup_doubt = ""
         self.contradicted = False
         self.wheels: WheelsEstimate | None = None
         self.biases = np.array([0.001, 0.002, -0.003]), np.array([0.01, -0.02, 0.03])
@@ -264,7 +264,7 @@ def test_unconfirmed_imu_is_not_used(scene: Scene) -> None:
 def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
     """Two of three stations that measure have no poses without it; with the third there are."""
     without = SimpleNamespace(converged=False, ambiguous=False)
-    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
+    window = few_prisms_window()
     setup = SimpleNamespace(untrusted=None, confirmed=False)
     selector = ImuSelector(
         IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), cast("Any", setup)
@@ -292,7 +292,11 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace
         converged=True,
         ambiguous=False,
         health=None,
-        setup_uncertain=False,
+        setup_doubt="",
+        lost_after_s=0.0,
+        beyond_chance=False,
+        followed_for_s=0.0,
+        measured_prisms=3,
         add_samples=lambda _: None,
     )
     setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="")
@@ -327,10 +331,11 @@ def test_setup_is_confirmed_anew_unless_the_samples_were_wrong_by_themselves(
     """After a shock, and where the prisms contradict, the IMU may have moved for good."""
     selector, window, setup = sound
     uses_of(selector, 0.0, 1.0)
-    window.health, window.setup_uncertain = (fault if fault != "prisms" else None), fault == "shock"
+    window.health = fault if fault != "prisms" else None
+    window.setup_doubt = fault if fault == "shock" else ""
     window.ambiguous = fault == "prisms"
     found = [uses_of(selector, 1.0, 1.6)[-1][0]]
-    window.health, window.setup_uncertain, window.ambiguous = None, False, False
+    window.health, window.setup_doubt, window.ambiguous = None, "", False
     found.append(uses_of(selector, 1.6, 7.0)[-1][0])
     setup.confirmed = True
     found.append(uses_of(selector, 7.0, 7.1)[-1][0])
@@ -353,10 +358,10 @@ def test_new_window_needs_two_prisms_where_the_wrong_prism_may_have_been_measure
     window.followed_for_s = 0.0
     uses_of(selector, 0.0, 1.0)
     found = [window.min_prisms]
-    window.health, window.setup_uncertain = fault, fault == "prisms"
+    window.health, window.setup_doubt = fault, fault if fault == "prisms" else ""
     uses_of(selector, 1.0, 1.1)
     found.append(window.min_prisms)
-    window.health, window.setup_uncertain = "stuck", False
+    window.health, window.setup_doubt = "stuck", ""
     for converged in (False, True):
         window.converged = converged
         uses_of(selector, 1.1, 1.2)
@@ -379,14 +384,14 @@ def test_quarantine_doubles_with_each_disagreement_in_a_row(
     """And is short again after a minute of use; it stays short where two prisms alone lose their poses to what the samples show."""
     selector, window, setup = sound
     monkeypatch.setattr(selector, "_prisms", prisms)
-    window.setup_uncertain, window.followed_for_s = uncertain, 0.0
+    window.followed_for_s = 0.0
     setup.restart = lambda **_: None
     found, now_s = [], 0.0
     for used_s in (1.0, 1.0, 1.0, PROVEN_S + 1.0):
         uses_of(selector, now_s, now_s + used_s)
-        window.health = "stuck"
+        window.health, window.setup_doubt = "stuck", "prisms" if uncertain else ""
         uses_of(selector, now_s + used_s, now_s + used_s + 0.1)
-        window.health = None
+        window.health, window.setup_doubt = None, ""
         (_, wrong_s), _ = uses_of(selector, now_s + used_s + 0.1, now_s + used_s + 20.0)
         found.append(wrong_s)
         now_s += used_s + 0.1 + wrong_s
@@ -439,9 +444,9 @@ def test_unconfirmed_imu_is_not_used_sooner_because_stations_had_none_long_ago(
     setup.confirmed = True
     uses_of(selector, 1.0, 30.0)
     cast("Any", selector._without).converged = False
-    window.health, window.setup_uncertain = "a shock", True
+    window.health = window.setup_doubt = "a shock"
     uses_of(selector, 30.0, 30.1)
-    window.health = None
+    window.health, window.setup_doubt = None, ""
     found = uses_of(selector, 30.1, 50.0)
     assert [use for use, _ in found] == [ImuUse.DISAGREES, ImuUse.UNCONFIRMED, ImuUse.USED]
     assert 0.1 + found[0][1] + found[1][1] == pytest.approx(NO_TRAJECTORY_S, abs=0.21)
@@ -480,6 +485,21 @@ def test_outage_of_all_prisms_with_an_unconfirmed_imu(scene: Scene, monkeypatch:
     assert {(each.valid, each.reason) for each in in_outage()} == {(False, "outage")}
 
 
+def few_prisms_window() -> SimpleNamespace:
+    """Return a window of fewer than three prisms in which all is well."""
+    return SimpleNamespace(
+        converged=True,
+        ambiguous=False,
+        health=None,
+        setup_doubt="",
+        lost_after_s=0.0,
+        beyond_chance=False,
+        followed_for_s=0.0,
+        measured_prisms=1,
+        add_samples=lambda _: None,
+    )
+
+
 STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
 
 
@@ -489,7 +509,7 @@ STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
         (1, 0.4, None, True),
         (1, 0.0, None, False),
         (2, 0.4, None, True),
-        (3, 0.4, None, False),
+        (3, 0.4, None, True),
         (1, 0.0, DISAGREES, True),
         (1, 0.0, STUCK, False),
         (2, 0.0, DISAGREES, False),
@@ -500,8 +520,7 @@ def test_contradiction_of_one_or_two_stations_lasts(
 ) -> None:
     """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
-    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
-    window.setup_uncertain = False
+    window = few_prisms_window()
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=prisms)
     selector.begin(START)
     found = []
@@ -517,14 +536,78 @@ def test_contradiction_of_one_or_two_stations_lasts(
     assert found[-1] == contradicted
 
 
+@pytest.mark.parametrize(
+    ("prisms", "what", "health", "contradicted"),
+    [
+        (1, "lost", None, True),
+        (2, "lost", None, False),
+        (1, "beyond chance", STUCK, True),
+        (1, "by chance", STUCK, False),
+        (1, "beyond chance", None, False),
+    ],
+)
+def test_trajectory_given_up_in_a_contradiction_contradicts_a_single_station(
+    prisms: int, what: str, health: str | None, *, contradicted: bool
+) -> None:
+    """The next one starts where the station then is: after a loss, or after a fault of the IMU that has nothing to do with it."""
+    without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
+    window = few_prisms_window()
+    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=prisms)
+    selector.begin(START)
+    for number in range(20):
+        window.ambiguous = number in (8, 9)
+        window.beyond_chance = window.ambiguous and what == "beyond chance"
+        window.converged = not (what == "lost" and number == 10)
+        window.lost_after_s = 0.4 if what == "lost" and number == 10 else 0.0
+        window.health = health if number == 9 else None
+        selector.add_samples(imu_samples(100 * number, count=100))
+        selector.take_samples()
+        selector.choose(0.5 * (number + 1))
+        if number < 9:
+            assert not selector.station_contradicted
+    assert selector.station_contradicted == contradicted
+
+
+def test_three_stations_of_which_one_measures_are_contradicted_until_the_others_tell() -> None:
+    """They are no better than one."""
+    without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
+    window = few_prisms_window()
+    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window))
+    selector.begin(START)
+    found = []
+    for number in range(20):
+        window.ambiguous = 8 <= number < 12
+        window.followed_for_s = 0.4 if number >= 12 else 0.0
+        window.measured_prisms = 3 if number >= 16 else 1
+        without.converged = number >= 18
+        selector.add_samples(imu_samples(100 * number, count=100))
+        selector.take_samples()
+        selector.choose(0.5 * (number + 1))
+        found.append(selector.station_contradicted)
+    assert found == [False] * 12 + [True] * 6 + [False] * 2
+
+
+def test_disagreement_before_the_imu_fell_silent_counts(
+    sound: tuple[ImuSelector, SimpleNamespace, SimpleNamespace],
+) -> None:
+    """Its samples ended before anybody asked, and its set-up must be confirmed anew."""
+    selector, window, setup = sound
+    uses_of(selector, 0.0, 1.0)
+    window.setup_doubt = DISAGREES
+    selector.choose(3.5)
+    assert (selector.use, setup.confirmed) == (ImuUse.DISAGREES, False)
+    window.setup_doubt = ""
+    selector.choose(3.6)
+    assert selector.use == ImuUse.SILENT
+
+
 @pytest.mark.parametrize(("consistent_before", "contradicted"), [(True, True), (False, False)])
 def test_trajectory_that_was_never_consistent_contradicts_no_station(
     *, consistent_before: bool, contradicted: bool
 ) -> None:
     """What a new start finds first may be wrong, and is bent towards the measurements."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
-    window = SimpleNamespace(converged=True, ambiguous=False, health=None, add_samples=lambda _: None)
-    window.setup_uncertain = False
+    window = few_prisms_window()
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=2)
     selector.begin(START)
     for number in range(20):
@@ -537,8 +620,9 @@ def test_trajectory_that_was_never_consistent_contradicts_no_station(
     assert selector.station_contradicted == contradicted
 
 
-def test_poses_of_a_contradicted_station_are_invalid(scene: Scene) -> None:
+def test_poses_of_a_contradicted_station_are_invalid(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """And say why."""
+    monkeypatch.setattr(ImuSelector, "_watch_stations", lambda *_: None)
     live = checked(scene)
     poses = []
     for each in arrivals(scene, 3.0):

@@ -16,7 +16,7 @@ from tsgt.geometry.inertial import (
     SaturationMonitor,
     usable_samples,
 )
-from tsgt.geometry.inertial.live.health import HOLD_S, MAX_AGE_S, STUCK_S, HealthMonitor
+from tsgt.geometry.inertial.live.health import HOLD_S, MAX_AGE_S, SHOCK, STUCK_S, HealthMonitor
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
@@ -217,8 +217,16 @@ def test_blow_puts_the_setup_in_doubt() -> None:
     assert np.flatnonzero(~used).tolist() == [700, 701]
     assert "a shock may have displaced it" in reasons
     assert reasons[-1] is None
-    assert monitor.setup_uncertain
-    assert not judged(SAMPLES)[0].setup_uncertain
+    assert monitor.setup_doubt
+    assert not judged(SAMPLES)[0].setup_doubt
+
+
+@pytest.mark.parametrize(("force_mps2", "doubt"), [(400.0, SHOCK), (np.inf, ""), (np.nan, "")])
+def test_blow_beyond_any_range_is_one_nevertheless(force_mps2: float, doubt: str) -> None:
+    """Some devices measure 40 g and more; what is no number is no blow."""
+    monitor, used, _ = judged(changed(slice(700, 701), force=np.array([0.0, force_mps2, 9.0])))
+    assert np.flatnonzero(~used).tolist() == [700]
+    assert monitor.setup_doubt == doubt
 
 
 def test_bad_samples_of_a_drive_are_left_out() -> None:

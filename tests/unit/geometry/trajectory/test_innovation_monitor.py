@@ -192,3 +192,30 @@ def test_ambiguity_without_inconsistent_measurements_follows_none() -> None:
     assert monitor.followed_for_s > 0.0
     monitor.set_unproven(5.0, frozenset({0}), needs_two_prisms=True)
     assert monitor.followed_for_s == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "first_nis", "after_s"),
+    [
+        ("aaA", NOT_BY_CHANCE, 0.0),
+        ("aAAb", NOT_BY_CHANCE, 0.1),
+        ("AAA", BY_CHANCE, 0.0),
+        ("AAAaaaaa", NOT_BY_CHANCE, 0.0),
+    ],
+)
+def test_time_of_a_contradiction_in_which_the_trajectory_was_lost(
+    text: str, first_nis: float, after_s: float
+) -> None:
+    """Whether it was followed or not; until a consistent trajectory is found, however often that is tried."""
+    monitor = _monitor_after(text, alone=5, first_nis=first_nis)
+    for _ in range(2):
+        monitor.reset(_observations(0))
+        assert monitor.lost_after_s == pytest.approx(after_s)
+    held = _observations(0, 0, 0, 0, 0, 0)
+    for row in range(1, 6):
+        rows = slice(row, row + 1)
+        monitor.select(np.zeros(len(monitor._time_s), np.bool_))
+        monitor.update(
+            held.select(rows), np.ones(1, np.bool_), np.zeros(1), np.zeros(1, np.bool_), np.zeros((1, 3))
+        )
+    assert monitor.lost_after_s == 0.0

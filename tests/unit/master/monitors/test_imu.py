@@ -47,6 +47,19 @@ def test_contradicted_station_is_an_event_once() -> None:
     assert not monitor.pose(contradicted, START + SECOND)
 
 
+def test_contradiction_of_three_stations_ends_and_may_come_again() -> None:
+    """While fewer of them measure; a valid pose ends it."""
+    monitor = ImuUseMonitor()
+    monitor.pose(PREDICTED, START)
+    three = replace(PREDICTED, stations=(PREDICTED.stations[0],) * 3)
+    contradicted = replace(three, valid=False, reason="contradicted")
+    for second in range(2):
+        (event,) = monitor.pose(contradicted, START + second * SECOND)
+        assert (event.event, event.station) == ("station_contradicted", None)
+        assert "until all three are measured again" in event.message
+        assert not monitor.pose(three, START + second * SECOND)
+
+
 def test_event_names_the_cause() -> None:
     """In words."""
     monitor = ImuUseMonitor()

@@ -177,9 +177,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
         return self._health.reason
 
     @property
-    def setup_uncertain(self) -> bool:
-        """Whether the mounting of the IMU may have changed: by a shock, or by whatever made the samples disagree with the prisms."""
-        return self._health.setup_uncertain
+    def setup_doubt(self) -> str:
+        """Why the mounting of the IMU may have changed: a shock, or whatever made the samples disagree with the prisms; else empty."""
+        return self._health.setup_doubt
 
     def add_samples(self, new: InertialSamples) -> None:
         """Add samples, in the order of time; they may precede others that were added before."""

@@ -33,6 +33,7 @@ SHOCK_MPS2 = 50.0
 INCONSISTENT_NIS = 25.0
 """NIS (3 degrees of freedom) of a measurement that disagrees with the samples; 1.5 in 100 000 consistent ones exceed it."""
 DISAGREEMENT_S = 1.2  # Within which two prisms must disagree: each is measured two or three times in it
+SHOCK = "a shock may have displaced it"
 DISAGREES_WITH_PRISMS = "it disagrees with the prisms"
 """Reason of a disagreement that innovations show."""
 ALONE = 3  # Successive measurements of one prism that disagree, where none other is measured: it cannot be told from the IMU
@@ -57,13 +58,13 @@ def usable_samples(samples: InertialSamples, imu: ImuParameters) -> InertialSamp
 def judge_magnitudes(
     angular_rate_radps: FloatArray, specific_force_mps2: FloatArray
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which of N samples, (N, 3) each, are within any measuring range, and which of these show a shock."""
+    """Return which of N samples, (N, 3) each, are within any measuring range, and which show a shock, beyond it, too."""
     # NaN is below no limit.
     largest_rates, largest_forces = (
         np.maximum.reduce(np.abs(each), axis=1) for each in (angular_rate_radps, specific_force_mps2)
     )
     possible: NDArray[np.bool_] = (largest_rates < MAX_RATE_RADPS) & (largest_forces < MAX_FORCE_MPS2)
-    return possible, possible & (largest_forces > SHOCK_MPS2)
+    return possible, np.isfinite(largest_forces) & (largest_forces > SHOCK_MPS2)
 
 
 class HealthMonitor:
@@ -76,7 +77,8 @@ class HealthMonitor:
 
     ``saturation``: finds values at the limit of the device, and knows those limits that earlier monitors have met.
 
-    ``setup_uncertain``: the mounting may have changed, by a shock or whatever made the samples disagree with the prisms.
+    ``setup_doubt``: why the mounting may have changed, a shock or whatever made the samples disagree with the prisms; empty: it has not.
+    It stays, whereas ``reason`` passes.
     """
 
     def __init__(self, imu: ImuParameters, saturation: SaturationMonitor | None = None) -> None:
@@ -85,7 +87,7 @@ class HealthMonitor:
         self._newest_s = -np.inf
         self._problem = ""
         self._problem_s = -np.inf
-        self.setup_uncertain = False
+        self.setup_doubt = ""
         self._same_s = 0.0
         self.stuck_from_s = np.inf  # The values have not changed since, for too long
         self._innovations: deque[tuple[float, int, bool]] = deque()
@@ -110,8 +112,8 @@ class HealthMonitor:
         if not usable.all():
             self._report("values beyond any measuring range", float(new.end_s[~usable][-1]))
         if shocks.any():
-            self.setup_uncertain = True
-            self._report("a shock may have displaced it", float(new.end_s[shocks][-1]))
+            self.setup_doubt = SHOCK
+            self._report(SHOCK, float(new.end_s[shocks][-1]))
         unchanged, at_limit = self._saturation.samples(new)
         self._check_stuck(new, unchanged)
         if at_limit.any():
@@ -147,7 +149,7 @@ class HealthMonitor:
         alone = len(measured) == 1 and len(newest) == ALONE and all(newest)
         if len(inconsistent) < 2 and not alone:
             return False
-        self.setup_uncertain = True
+        self.setup_doubt = DISAGREES_WITH_PRISMS
         self._report(DISAGREES_WITH_PRISMS, max(self._now_s, float(time_s[-1])))
         self._innovations.clear()
         return True

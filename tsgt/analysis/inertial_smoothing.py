@@ -11,6 +11,8 @@ from tsgt.errors import GeometryError
 from tsgt.estimation import InertialSetupUncertainty, centroid_m, inertial_samples, wheel_samples
 from tsgt.geometry.batch import overall_scale, scale_noise
 from tsgt.geometry.inertial import fit_inertial_trajectory, judge_magnitudes, usable_samples
+from tsgt.geometry.trajectory import AMBIGUITY_MARGIN_S, NOT_BY_CHANCE_NIS, OWN_PRISM_M
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -40,6 +42,11 @@ SHOCK_REMEDY = (
     "poses are degraded from then on, and their covariance allows for a turn by a degree; calibrate it again"
 )
 
+MOVED_REMEDY = "a tripod or prism may have moved, and the poses are invalid from then on; check the stations (tsgt calibrate check)"
+
+MIN_TOLD = 8  # Measurements of each of three prisms that tell what happened before them
+MOVED_SQUARE = 25.0  # Squared distance in sigmas of two successive measurements of one prism
+
 NOISE_SCALE_PRIOR = 30.0
 """Components as many as the prior on a factor on the noise is worth; the factor 1 is that of the data sheet."""
 
@@ -63,9 +70,9 @@ class ImuUse:
     noise_scales: FloatArray  # (S + 1, 3) factors on the stated noise of the measurements
     noise_scale: float  # Their root mean square over all measurements and components
     unused: tuple[UnusedInterval, ...]
-    displaced_from_s: float = (
-        np.inf
-    )  # When a shock may have displaced it, which fewer than three prisms do not tell
+    # With fewer than three prisms: when a shock may have displaced it, and when a tripod or prism seems to have moved
+    displaced_from_s: float = np.inf
+    moved_from_s: float = np.inf
     odometry_samples: int = 0  # Of the wheel odometry that was used with it
 
     def unused_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
@@ -90,13 +97,12 @@ def fit_with_imu(
     origin_ns: int,
     noise_scales: FloatArray,
     tuned: bool,
-    few_prisms: bool,
     on_progress: Callable[[float], None] | None = None,
 ) -> ImuUse:
     """Fit a trajectory to observations, with their stated noise, and to the samples of the IMU.
 
-    ``noise_scales``: factors on the noise, (S + 1, 3); unless ``tuned`` they are estimated here. ``few_prisms``: fewer than three
-    were measured. Raises GeometryError: the samples do not belong to the measurements or contradict them, or no trajectory fits.
+    ``noise_scales``: factors on the noise, (S + 1, 3); unless ``tuned`` they are estimated here. Raises GeometryError: the
+    samples do not belong to the measurements or contradict them, or no trajectory fits.
     """
     imu = parameters.imu
     assert imu is not None  # noqa: S101 (the caller checks)
@@ -135,8 +141,8 @@ def fit_with_imu(
     windows = max((end_s - start_s) / WINDOW_S, 1.0)
     if len(contradicted) > MAX_CONTRADICTED * windows:
         raise GeometryError(
-            "the samples of the IMU contradict the measurements: its mounting, its latency or its axes are wrong, or it is loose; "
-            "calibrate it (tsgt calibrate imu)"
+            "the samples of the IMU contradict the measurements: its mounting, its latency or its axes are wrong, or it is loose "
+            "(calibrate it: tsgt calibrate imu), or a tripod has moved (tsgt calibrate check)"
         )
     _check_biases(found, imu.noise)
     numbers = [station.station for station in parameters.stations]
@@ -147,9 +153,34 @@ def fit_with_imu(
         noise_scales,
         overall_scale(observations, noise_scales),
         (*gaps(samples, start_s, end_s), *contradicted),
-        first_shock_s(recorded) if few_prisms else np.inf,
+        first_untold_s(observations, first_shock_s(recorded)),
+        first_untold_s(observations, first_move_s(found)),
         0 if wheels is None else len(wheels[0]),
     )
+
+
+def first_untold_s(observations: Observations, from_s: float) -> float:
+    """Return when something happened that three prisms would have told; infinite if they were measured from then on."""
+    counts = np.bincount(observations.prism[observations.time_s > from_s])
+    return np.inf if np.count_nonzero(counts >= MIN_TOLD) >= MIN_PRISMS else from_s
+
+
+def first_move_s(fit: InertialFit) -> float:
+    """Return when a station seems to have moved, by successive measurements of its prism that contradict the IMU; else infinite.
+
+    The trajectory follows the station within two seconds, so that none is farther from it than :data:`OWN_PRISM_M`, as those
+    of another prism are. A tripod moved by 20 mm gives 27 to 112, one that has not moved 15 at most (imu_trust, seeds 13 and 14).
+    """
+    squares, time_s, prism = fit.squared_distances, fit.observations.time_s, fit.observations.prism
+    own = np.linalg.norm(fit.residuals_m, axis=1) < OWN_PRISM_M
+    found = np.inf
+    for number in np.unique(prism):
+        rows = np.flatnonzero((prism == number) & own)
+        pairs = np.stack([squares[rows][:-1], squares[rows][1:]])
+        pairs = (pairs.min(axis=0) > MOVED_SQUARE) & (pairs.max(axis=0) > NOT_BY_CHANCE_NIS)
+        if pairs.any():
+            found = min(found, float(time_s[rows][:-1][pairs][0]) - AMBIGUITY_MARGIN_S)
+    return found
 
 
 def first_shock_s(samples: InertialSamples) -> float:
@@ -225,6 +256,7 @@ def imu_keys(used: ImuUse | None, problem: str) -> dict[str, Any]:
             "samples": len(used.samples),
             "unused_s": used.unused_s,
             **({"displaced_from_s": used.displaced_from_s} if np.isfinite(used.displaced_from_s) else {}),
+            **({"moved_from_s": used.moved_from_s} if np.isfinite(used.moved_from_s) else {}),
             **({"odometry_samples": used.odometry_samples} if used.odometry_samples else {}),
             "tilt_sigma_mrad": 1e3 * used.fit.tilt_sigma_rad,
         }

@@ -13,6 +13,7 @@ from tsgt.estimation import (
     Degradation,
     MeasurementHistory,
     PoseBatch,
+    Reason,
     measured_at_ns,
     usable,
 )
@@ -68,7 +69,8 @@ class PoseSeries:
     def with_imu(self, imu: ImuUse, without: PoseBatch | None) -> PoseBatch:
         """Return poses with an IMU; where it is not to be used those without it, or invalid ones.
 
-        Where a shock may have displaced it they are degraded, and their covariance allows for that, as live.
+        Where a shock may have displaced it they are degraded, and their covariance allows for that, as live; where a station seems to
+        have moved they are invalid.
         """
         seen = self._history(imu.fit.residuals_m)
 
@@ -81,6 +83,8 @@ class PoseSeries:
                 epochs_ns, seen, states, covariance, common=common, converged=~imu.unused_at(time_s)
             )
             batch.degraded[displaced & batch.valid] |= Degradation.IMU_UNCONFIRMED
+            moved = batch.valid & (time_s > imu.moved_from_s)
+            batch.reason[moved], batch.degraded[moved] = Reason.CONTRADICTED, 0
             return batch
 
         poses = PoseBatch.collected(len(self._epochs_ns), map(chunk, _chunks(self._epochs_ns)))

@@ -274,7 +274,6 @@ def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -
             origin_ns=prepared.origin_ns,
             noise_scales=prepared.motion.noise_scales,
             tuned=prepared.motion.tuned,
-            few_prisms=not prepared.complete,
             on_progress=on_progress,
         )
     except GeometryError as error:

@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 import tsgt
-from tsgt.analysis.inertial_smoothing import SHOCK_REMEDY
+from tsgt.analysis.inertial_smoothing import MOVED_REMEDY, SHOCK_REMEDY
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.refinement import Refine
@@ -280,6 +280,8 @@ def imu_text(found: SmoothedPoses) -> str | None:
         text += f"; {seconds:.1f} s {words}" if seconds else ""
     if np.isfinite(used.displaced_from_s):
         text += f"; from {used.displaced_from_s:.1f} s on a shock may have displaced it: {SHOCK_REMEDY}"
+    if np.isfinite(used.moved_from_s):
+        text += f"; from {used.moved_from_s:.1f} s on measurements contradict it: {MOVED_REMEDY}"
     return text
 
 

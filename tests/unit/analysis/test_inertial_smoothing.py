@@ -14,12 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.errors import DegenerateGeometryError, RecordingError
-from tsgt.estimation import Degradation, named_point
-from tsgt.model import SetupCovariance
+from tsgt.estimation import Degradation, Reason, named_point
+from tsgt.geometry import cartesian_to_polar, polar_to_cartesian
+from tsgt.model import PolarMeasurement, SetupCovariance
 
 if TYPE_CHECKING:
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.geometry import FloatArray
+    from tsgt.model import Measurement
     from tsgt.recording import Recording
 
 PATH = Path("field.jsonl")
@@ -30,6 +32,21 @@ MARGIN = 40  # Epochs at either end
 def smooth(recording: Recording) -> SmoothedRecording:
     """Smooth without refinement, which takes most of the time."""
     return smooth_recording(recording, path=PATH, refine="off")
+
+
+def moved_measurement(measurement: Measurement, by_m: float) -> Measurement:
+    """Return what a station measures that was moved along its x axis."""
+    assert isinstance(measurement, PolarMeasurement)
+    assert measurement.slope_distance_m is not None
+    angles = measurement.horizontal_angle_rad, measurement.zenith_angle_rad
+    point = polar_to_cartesian(*angles, measurement.slope_distance_m) - np.array([by_m, 0.0, 0.0])
+    horizontal_rad, zenith_rad, distance_m = (float(each) for each in cartesian_to_polar(point))
+    return replace(
+        measurement,
+        horizontal_angle_rad=horizontal_rad % (2 * np.pi),
+        zenith_angle_rad=zenith_rad,
+        slope_distance_m=distance_m,
+    )
 
 
 def position_errors_m(found: SmoothedRecording) -> FloatArray:
@@ -167,3 +184,38 @@ def test_wrong_latency_of_the_imu_is_an_error_of_one_station() -> None:
     imu = replace(IMU, latency_ns=IMU.latency_ns + 40_000_000)
     with pytest.raises(RecordingError, match=r"latency of the IMU is wrong.*--imu-setup"):
         smooth(imu_recording(shaken_drive(60.0), stations=1, imu=imu))
+
+
+@pytest.mark.parametrize(("by_m", "moved"), [(0.0, False), (0.02, True), (0.3, True)])
+def test_poses_of_a_single_station_that_has_moved_are_invalid(by_m: float, *, moved: bool) -> None:
+    """From just before the move on: the trajectory follows the station, and nothing tells where it is."""
+    recording = imu_recording(DRIVE, stations=1)
+    measurements = [
+        moved_measurement(each, by_m) if each.stamp_ns > START + 14 * 10**9 else each
+        for each in recording.measurements
+    ]
+    found = smooth(replace(recording, measurements=measurements)).poses
+    after = found.stamp_ns > START + 14 * 10**9
+    assert (found.reason[after] == Reason.CONTRADICTED).any() == moved
+    assert found.valid[after].any() != moved
+    assert found.valid[found.stamp_ns < START + 9 * 10**9][MARGIN:].all()
+
+
+@pytest.mark.parametrize(("measured_s", "displaced"), [(5.0, True), (26.0, False)])
+def test_shock_is_told_by_three_prisms_after_it_alone(measured_s: float, *, displaced: bool) -> None:
+    """That the third was measured before says nothing."""
+    recording = imu_recording(DRIVE)
+    measurements = [
+        each
+        for each in recording.measurements
+        if each.station < 3 or each.stamp_ns < START + measured_s * 1e9
+    ]
+    shock = [
+        replace(each, specific_force_mps2=((0.0, 90.0, 9.8), *each.specific_force_mps2[1:]))
+        if 0 <= each.stamp_ns[0] - START - 14 * 10**9 < each.stamp_ns[-1] - each.stamp_ns[0]
+        else each
+        for each in recording.imu_samples
+    ]
+    found = smooth(replace(recording, measurements=measurements, imu_samples=shock)).poses
+    after = found.valid & (found.stamp_ns > START + 15 * 10**9)
+    assert ((found.degraded[after] & Degradation.IMU_UNCONFIRMED) != 0).all() == displaced

@@ -13,6 +13,7 @@ from tsgt.geometry.trajectory.gauss_newton import (
     solve,
 )
 from tsgt.geometry.trajectory.initialisation import initial_guess
+from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, NOT_BY_CHANCE_NIS, OWN_PRISM_M
 from tsgt.geometry.trajectory.measurement_factors import (
     LinearisedMeasurements,
     Observations,
@@ -31,7 +32,10 @@ from tsgt.geometry.trajectory.sensitivity import SetupJacobian, coupling
 from tsgt.geometry.trajectory.states import POSE_DIM, STATE_DIM, States, concatenate_states
 
 __all__ = [
+    "AMBIGUITY_MARGIN_S",
     "MIN_KNOT_SPACING_S",
+    "NOT_BY_CHANCE_NIS",
+    "OWN_PRISM_M",
     "POSE_DIM",
     "STATE_DIM",
     "FixedLagSmoother",

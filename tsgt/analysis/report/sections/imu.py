@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.figures import curve, panels_height_mm, stroke
-from tsgt.analysis.inertial_smoothing import SHOCK_REMEDY
+from tsgt.analysis.inertial_smoothing import MOVED_REMEDY, SHOCK_REMEDY
 from tsgt.analysis.report.page import ReportFigure, Section, Table, format_number
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial import preintegrate
@@ -67,6 +67,10 @@ def imu_section(f: Findings, axis: TimeAxis) -> Section | None:
         text.append(
             f"From {format_number(imu.displaced_from_s)} s on a shock may have displaced the IMU on the robot, which fewer than three "
             f"stations do not show: {SHOCK_REMEDY}."
+        )
+    if np.isfinite(imu.moved_from_s):
+        text.append(
+            f"From {format_number(imu.moved_from_s)} s on measurements contradict the IMU: {MOVED_REMEDY}."
         )
     innovation = numbers["rotation_innovation_deg"]
     if innovation is not None:

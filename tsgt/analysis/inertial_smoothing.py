@@ -169,7 +169,8 @@ def first_move_s(fit: InertialFit) -> float:
     """Return when a station seems to have moved, by successive measurements of its prism that contradict the IMU; else infinite.
 
     The trajectory follows the station within two seconds, so that none is farther from it than :data:`OWN_PRISM_M`, as those
-    of another prism are. A tripod moved by 20 mm gives 27 to 112, one that has not moved 15 at most (imu_trust, seeds 13 and 14).
+    of another prism are. A tripod moved by 20 mm gives 27 to 112, in one drive 22 and 34, which is not told from rain; one that has not
+    moved gives 15 at most (imu_trust, seeds 13 and 14).
     """
     squares, time_s, prism = fit.squared_distances, fit.observations.time_s, fit.observations.prism
     own = np.linalg.norm(fit.residuals_m, axis=1) < OWN_PRISM_M

@@ -186,7 +186,7 @@ def test_wrong_latency_of_the_imu_is_an_error_of_one_station() -> None:
         smooth(imu_recording(shaken_drive(60.0), stations=1, imu=imu))
 
 
-@pytest.mark.parametrize(("by_m", "moved"), [(0.0, False), (0.02, True), (0.3, True)])
+@pytest.mark.parametrize(("by_m", "moved"), [(0.0, False), (0.03, True), (0.3, True)])
 def test_poses_of_a_single_station_that_has_moved_are_invalid(by_m: float, *, moved: bool) -> None:
     """From just before the move on: the trajectory follows the station, and nothing tells where it is."""
     recording = imu_recording(DRIVE, stations=1)

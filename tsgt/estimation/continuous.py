@@ -29,6 +29,7 @@ from tsgt.geometry import check_layout
 from tsgt.geometry.batch import scale_noise
 from tsgt.geometry.inertial import InertialFixedLagSmoother, SaturationMonitor
 from tsgt.geometry.trajectory import POSE_DIM, FixedLagSmoother, concatenate_states
+from tsgt.model import Status
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from tsgt.model import ImuSamples, Measurement, OdometrySamples, Parameters
 
 SMOOTHING_INTERVAL_NS = 500_000_000
+TILTED = 2  # Successive measurements by which a single instrument that is not level has moved
 
 _NONE = np.empty((0, POSE_DIM, POSE_DIM))
 
@@ -78,6 +80,7 @@ class ContinuousEstimator:
             )
         )
         self._pending: list[Measurement] = []
+        self._tilted = 0  # Successive measurements whose instrument was not level
         none = np.empty(0, np.int64)
         self._unusable: list[list[int]] = [[] for _ in self._columns]
         self._history = MeasurementHistory(
@@ -135,6 +138,9 @@ class ContinuousEstimator:
         if station is None or column is None or not has_plausible_time(measurement, station):
             return
         self.begin_at(measurement.received_ns)
+        self._tilted = self._tilted + 1 if measurement.status is Status.TILT else 0
+        if self._imu is not None and len(self._columns) == 1 and self._tilted == TILTED:
+            self._imu.contradict()
         if usable(measurement):
             self._pending.append(measurement)
         else:

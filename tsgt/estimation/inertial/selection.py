@@ -273,6 +273,10 @@ class ImuSelector:
         self._without.marginalise_before(before_s)
         self._with.marginalise_before(before_s)
 
+    def contradict(self) -> None:
+        """Note that a single station has moved, as its instrument says."""
+        self.station_contradicted |= self._established
+
     def _watch_stations(self, found: ImuUse) -> None:
         """Note whether measurements of one or two prisms contradicted the IMU, and are followed from then on.
 

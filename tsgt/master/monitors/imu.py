@@ -105,16 +105,17 @@ class OdometryUseMonitor(Observer):
 
 
 def _contradiction(stations: list[int], now_ns: int) -> EventRecord:
-    until = "the master is restarted or takes a new set-up"
+    until, stayed = "the master is restarted or takes a new set-up", "then stayed at the new position"
     if len(stations) >= MIN_PRISMS:
         until = "all three are measured again"
         measured, whose = "those stations that still measure", "a tripod or prism"
     elif len(stations) == 1:
         measured, whose = f"station {stations[0]}", "its tripod or prism"
+        stayed += ", or its instrument was not level"
     else:
         measured, whose = f"stations {' and '.join(map(str, stations))}", "a tripod or prism"
     message = (
-        f"measurements of {measured} contradicted the IMU and then stayed at the new position: {whose} may have moved; "
+        f"measurements of {measured} contradicted the IMU and {stayed}: {whose} may have moved; "
         f"poses are invalid until {until}. Check the stations first: tsgt calibrate check"
     )
     station = stations[0] if len(stations) == 1 else None

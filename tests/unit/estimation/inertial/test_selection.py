@@ -28,7 +28,7 @@ from tsgt.estimation.pose_batch import ImuUse
 from tsgt.geometry.inertial import WheelsEstimate
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.geometry.trajectory import FixedLagSmoother
-from tsgt.model import ImuSamples, Measurement, OdometryParameters, OdometrySamples
+from tsgt.model import ImuSamples, Measurement, OdometryParameters, OdometrySamples, Status
 from tsgt.recording import PoseRecord, encode_line
 
 if TYPE_CHECKING:
@@ -716,3 +716,27 @@ def wheels_beside(samples: ImuSamples) -> OdometrySamples:
         yaw_rate_radps=None,
         valid=(True,),
     )
+
+
+@pytest.mark.parametrize(
+    ("prisms", "statuses", "contradicted"),
+    [
+        (1, "tilt tilt ok", True),
+        (1, "tilt ok tilt", False),
+        (1, "no_target no_target", False),
+        (2, "tilt tilt", False),
+    ],
+)
+def test_single_instrument_that_is_not_level_has_moved(
+    scene: Scene, prisms: int, statuses: str, *, contradicted: bool
+) -> None:
+    """Once is a bump; of several the others tell."""
+    stations = scene.parameters.stations[:prisms]
+    parameters = replace(scene.parameters, stations=stations, prisms=scene.parameters.prisms[:prisms])
+    estimator = ContinuousEstimator(parameters)
+    assert estimator._imu is not None
+    estimator._imu._established = True
+    measurement = next(each for each in arrivals(scene, 1.0) if isinstance(each, Measurement))
+    for status in statuses.split():
+        estimator.add(replace(measurement, status=Status(status)))
+    assert estimator._imu.station_contradicted == contradicted

@@ -179,6 +179,7 @@ def test_clipped_samples_are_left_out() -> None:
     assert 1e3 * np.sqrt((position_errors_m(found) ** 2).mean()) < 6.0
 
 
+@pytest.mark.slow
 def test_wrong_latency_of_the_imu_is_an_error_of_one_station() -> None:
     """A single prism tells it."""
     imu = replace(IMU, latency_ns=IMU.latency_ns + 40_000_000)
@@ -186,7 +187,9 @@ def test_wrong_latency_of_the_imu_is_an_error_of_one_station() -> None:
         smooth(imu_recording(shaken_drive(60.0), stations=1, imu=imu))
 
 
-@pytest.mark.parametrize(("by_m", "moved"), [(0.0, False), (0.03, True), (0.3, True)])
+@pytest.mark.parametrize(
+    ("by_m", "moved"), [(0.0, False), (0.03, True), pytest.param(0.3, True, marks=pytest.mark.slow)]
+)
 def test_poses_of_a_single_station_that_has_moved_are_invalid(by_m: float, *, moved: bool) -> None:
     """From just before the move on: the trajectory follows the station, and nothing tells where it is."""
     recording = imu_recording(DRIVE, stations=1)
@@ -201,6 +204,7 @@ def test_poses_of_a_single_station_that_has_moved_are_invalid(by_m: float, *, mo
     assert found.valid[found.stamp_ns < START + 9 * 10**9][MARGIN:].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("measured_s", "displaced"), [(5.0, True), (26.0, False)])
 def test_shock_is_told_by_three_prisms_after_it_alone(measured_s: float, *, displaced: bool) -> None:
     """That the third was measured before says nothing."""

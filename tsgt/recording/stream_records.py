@@ -209,8 +209,9 @@ class PoseRecord(FiniteNumbers):
     """Why it is invalid: ``outage`` (a prism without measurements for too long), ``station_status`` (the instrument
     reported an error), ``degenerate_geometry`` (prisms collinear or coincident), ``residual`` (the prisms miss their
     layout by too much), ``uncertain`` (the pose is not known well enough, or nothing confirms it yet), ``tilt`` (the
-    robot would lean too far: mirrored layout or swapped prisms), ``contradicted`` (with one or two stations: the IMU has contradicted
-    their measurements, so a tripod or prism may have moved; until the master is restarted or takes another set-up). Empty when valid."""
+    robot would lean too far: mirrored layout or swapped prisms), ``contradicted`` (with one or two stations, or while
+    no more of three measure: the IMU has contradicted their measurements, or a single instrument was not level, so a tripod or prism
+    may have moved; until the master is restarted or takes another set-up, or all three are measured). Empty when valid."""
     quality: Quality | None = None
     """``good``; ``degraded``: valid, but with less reserve, see ``degraded_by``; ``invalid``: not ``valid``. Null in
     recordings of older versions."""

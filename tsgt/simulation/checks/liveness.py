@@ -110,7 +110,8 @@ def contradicted_by_station(
 ) -> bool:
     """Whether measurements are said to contradict the IMU for what a station did.
 
-    Its stamps were late, or it followed another prism or had another's number in its configuration. The set-up of the IMU is not checked again before new measurements suffice for that.
+    Its stamps were late, or it followed another prism or had another's number in its configuration. The set-up of the IMU is not
+    checked again before new measurements suffice for that.
     """
     prisms = {station.station: station.prism for station in result.parameters.stations}
 

@@ -264,7 +264,7 @@ def test_unconfirmed_imu_is_not_used(scene: Scene) -> None:
 def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
     """Two of three stations that measure have no poses without it; with the third there are."""
     without = SimpleNamespace(converged=False, ambiguous=False)
-    window = few_prisms_window()
+    window = sound_window(measured_prisms=1)
     setup = SimpleNamespace(untrusted=None, confirmed=False)
     selector = ImuSelector(
         IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), cast("Any", setup)
@@ -283,12 +283,9 @@ def test_unconfirmed_imu_is_used_where_there_is_nothing_else() -> None:
     assert uses.index(ImuUse.USED) == round(2 * NO_TRAJECTORY_S)
 
 
-@pytest.fixture
-def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace, SimpleNamespace]:
-    """Return what chooses, a window with IMU, and the monitor of its set-up; all is well."""
-    monkeypatch.setattr(ImuSelector, "_compare", lambda *_: None)
-    without = SimpleNamespace(converged=True, ambiguous=False)
-    window = SimpleNamespace(
+def sound_window(*, measured_prisms: int = 3) -> SimpleNamespace:
+    """Return a window with IMU in which all is well."""
+    return SimpleNamespace(
         converged=True,
         ambiguous=False,
         health=None,
@@ -296,9 +293,17 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace
         lost_after_s=0.0,
         beyond_chance=False,
         followed_for_s=0.0,
-        measured_prisms=3,
+        measured_prisms=measured_prisms,
         add_samples=lambda _: None,
     )
+
+
+@pytest.fixture
+def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace, SimpleNamespace]:
+    """Return what chooses, a window with IMU, and the monitor of its set-up; all is well."""
+    monkeypatch.setattr(ImuSelector, "_compare", lambda *_: None)
+    without = SimpleNamespace(converged=True, ambiguous=False)
+    window = sound_window()
     setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="")
     setup.restart = lambda: vars(setup).update(confirmed=False)
 
@@ -485,21 +490,6 @@ def test_outage_of_all_prisms_with_an_unconfirmed_imu(scene: Scene, monkeypatch:
     assert {(each.valid, each.reason) for each in in_outage()} == {(False, "outage")}
 
 
-def few_prisms_window() -> SimpleNamespace:
-    """Return a window of fewer than three prisms in which all is well."""
-    return SimpleNamespace(
-        converged=True,
-        ambiguous=False,
-        health=None,
-        setup_doubt="",
-        lost_after_s=0.0,
-        beyond_chance=False,
-        followed_for_s=0.0,
-        measured_prisms=1,
-        add_samples=lambda _: None,
-    )
-
-
 STUCK, DISAGREES = "it repeats the same values", "it disagrees with the prisms"
 
 
@@ -520,7 +510,7 @@ def test_contradiction_of_one_or_two_stations_lasts(
 ) -> None:
     """Where the trajectory follows what contradicted the IMU; one measurement alone, an outlier, or an IMU that is stuck, is none."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
-    window = few_prisms_window()
+    window = sound_window(measured_prisms=1)
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=prisms)
     selector.begin(START)
     found = []
@@ -551,7 +541,7 @@ def test_trajectory_given_up_in_a_contradiction_contradicts_a_single_station(
 ) -> None:
     """The next one starts where the station then is: after a loss, or after a fault of the IMU that has nothing to do with it."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
-    window = few_prisms_window()
+    window = sound_window(measured_prisms=1)
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=prisms)
     selector.begin(START)
     for number in range(20):
@@ -571,7 +561,7 @@ def test_trajectory_given_up_in_a_contradiction_contradicts_a_single_station(
 def test_three_stations_of_which_one_measures_are_contradicted_until_the_others_tell() -> None:
     """They are no better than one."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
-    window = few_prisms_window()
+    window = sound_window(measured_prisms=1)
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window))
     selector.begin(START)
     found = []
@@ -607,7 +597,7 @@ def test_trajectory_that_was_never_consistent_contradicts_no_station(
 ) -> None:
     """What a new start finds first may be wrong, and is bent towards the measurements."""
     without = SimpleNamespace(converged=False, ambiguous=True, update=lambda _: None)
-    window = few_prisms_window()
+    window = sound_window(measured_prisms=1)
     selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window), prisms=2)
     selector.begin(START)
     for number in range(20):

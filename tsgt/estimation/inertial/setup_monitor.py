@@ -49,6 +49,7 @@ FIRST_NS = 12_000_000_000  # Of measurements before the first check: fewer do no
 UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 SILENT_NS = 1_000_000_000  # Without a record for this long the measurements' time bounds the records, too
 INTERVAL_NS = 20_000_000_000
+UNWATCHED_NS = 1_000_000_000  # Without samples for longer, a knock may have been missed: somebody may have plugged the IMU in again
 RESULT_NS = 2_000_000_000  # From the start of a check to its result; a slow computer takes a second
 
 MAX_FIT_ITERATIONS, MAX_JOINT_ITERATIONS = 40, 30
@@ -176,6 +177,7 @@ class ImuSetupMonitor:
         self._next_ns: int | None = None
         self._result: Callable[[], SetupCheck] | None = None
         self._result_ns = 0
+        self._watched_until_ns: int | None = None
         self._standing: dict[Cause, SetupFinding] = {}
         self._confirmed = self._displaced = False
         self._open = tuple(_PARTS.values())
@@ -229,13 +231,19 @@ class ImuSetupMonitor:
         """Take samples of the IMU at their ``received_ns``; after a shock the set-up is confirmed again.
 
         Fewer than three prisms confirm nothing any more then: they do not tell all rotations, and what they do not tell is not as
-        configured for certain. Here, because lines that come late, or before the first measurement, reach no trajectory.
+        configured for certain. Here, because lines that come late, or before the first measurement, reach no trajectory. They confirm
+        again, too, after a time without samples; three prisms show at once what has changed.
         """
+        few_prisms = len(self._parameters.prisms) < MIN_PRISMS
+        watched_until_ns, self._watched_until_ns = self._watched_until_ns, record.stamp_ns[-1]
+        begin_ns = record.stamp_ns[0] - record.duration_ns[0]
+        unwatched = watched_until_ns is not None and begin_ns - watched_until_ns > UNWATCHED_NS
         _, shocks = judge_magnitudes(
             np.array(record.angular_rate_radps), np.array(record.specific_force_mps2)
         )
         if shocks.any():
-            self._displaced |= len(self._parameters.prisms) < MIN_PRISMS
+            self._displaced |= few_prisms
+        if shocks.any() or (few_prisms and unwatched):
             self.restart()
         self._records.append(record)
         while self._records[0].received_ns < record.received_ns - WINDOW_NS:

@@ -74,7 +74,9 @@ class Monitored:
         """Feed it."""
         for _ in range(seconds):
             now_ns = START + self.seconds * SECOND
-            self.monitor.samples(replace(self.samples, received_ns=now_ns))
+            later_ns = now_ns - self.samples.stamp_ns[-1]
+            stamps = tuple(each + later_ns for each in self.samples.stamp_ns)
+            self.monitor.samples(replace(self.samples, received_ns=now_ns, stamp_ns=stamps))
             self.monitor.measurement(replace(self.point, received_ns=now_ns))
             self.seconds += 1
         return list(self.monitor.take_events())
@@ -141,6 +143,18 @@ def test_few_prisms_confirm_anew_after_a_disagreement(prisms: int) -> None:
     monitored.run(18)
     monitored.monitor.restart()
     assert not monitored.monitor.confirmed
+    monitored.run(18)
+    assert monitored.monitor.confirmed
+
+
+@pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
+def test_few_prisms_confirm_anew_after_a_time_without_samples(prisms: int, *, confirmed: bool) -> None:
+    """A knock in it shows no shock."""
+    monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
+    monitored.run(18)
+    monitored.seconds += 2
+    monitored.run(1)
+    assert monitored.monitor.confirmed == confirmed
     monitored.run(18)
     assert monitored.monitor.confirmed
 

@@ -478,6 +478,25 @@ def test_time_before_the_first_knot() -> None:
     assert (np.diag(covariance[1]) < 1.0).all()
 
 
+def test_time_before_a_single_knot() -> None:
+    """The first measurements after an outage that is longer than the lag leave one knot, at which they all are."""
+    live, observations = Live(), measurements()
+    live.measure(observations.select(observations.time_s < 4.0))
+    row = int(np.searchsorted(observations.time_s, 7.5))
+    first = observations.select(slice(row, row + 1))
+    live.sample_until(first.time_s[0] + DELAY_S)
+    live.window.update(first)
+    live.window.marginalise_before(float(first.time_s[0]))
+    live.window.update(replace(first, time_s=first.time_s + 0.001))
+    trajectory = live.window.trajectory()
+    assert len(trajectory.inside.knots.time_s) == 1
+    knot_s = float(trajectory.inside.knots.time_s[0])
+    states, covariance = trajectory.at(np.array([knot_s - 0.5, knot_s]))
+    assert states.time_s[0] == knot_s - 0.5
+    assert (np.diag(covariance[0]) >= 1e4).all()
+    assert (np.diag(covariance[1]) < 1.0).all()
+
+
 @pytest.mark.parametrize("step", ["_update_tracked", "_initialise", "_eliminate_before"])
 def test_matrix_that_cannot_be_factorised_loses_the_trajectory(
     step: str, monkeypatch: pytest.MonkeyPatch

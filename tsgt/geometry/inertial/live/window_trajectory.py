@@ -39,29 +39,25 @@ class WindowTrajectory:
 
         Before the first knot, where nothing is known, the pose is that of the knot, with a covariance that says so.
         """
+        first_s = self.inside.knots.time_s[0]
+        known_s = np.maximum(time_s, first_s)
         beyond = self._beyond(time_s)
-        parts = []
-        if not beyond.all() or not len(time_s):
-            first_s = self.inside.knots.time_s[0]
-            states, covariance = self.inside.at(np.maximum(time_s[~beyond], first_s), dim=dim)
-            before = time_s[~beyond] < first_s
-            covariance[before] += UNKNOWN_SIGMA**2 * np.eye(dim)
-            parts.append((replace(states, time_s=time_s[~beyond]), covariance))
-        parts += [self.predict(each, dim) for each in time_s[beyond].tolist()]
-        if len(parts) == 1:
-            return parts[0]
+        parts = [] if beyond.all() and len(time_s) else [self.inside.at(known_s[~beyond], dim=dim)]
+        parts += [self.predict(each, dim) for each in known_s[beyond].tolist()]
         order = _order(beyond)
-        states = concatenate_states([each for each, _ in parts])
-        return states.select(order), np.concatenate([each for _, each in parts])[order]
+        states = concatenate_states([each for each, _ in parts]).select(order)
+        covariance = np.concatenate([each for _, each in parts])[order]
+        covariance[time_s < first_s] += UNKNOWN_SIGMA**2 * np.eye(dim)
+        return replace(states, time_s=time_s), covariance
 
     def common_at(self, time_s: FloatArray, *, dim: int = POSE_DIM) -> FloatArray | None:
         """Return the (N, 6, 6) covariance that the set-up's uncertainty adds; None: unknown."""
         if self.inside.displacement is None:
             return None
+        known_s = np.maximum(time_s, self.inside.knots.time_s[0])
         beyond = self._beyond(time_s)
-        within_s = np.maximum(time_s[~beyond], self.inside.knots.time_s[0])
-        parts = [self.inside.common_at(within_s, dim=dim)] if len(within_s) else []
-        parts += [self.predicted_common(each, dim) for each in time_s[beyond].tolist()]
+        parts = [] if beyond.all() else [self.inside.common_at(known_s[~beyond], dim=dim)]
+        parts += [self.predicted_common(each, dim) for each in known_s[beyond].tolist()]
         known = [each for each in parts if each is not None]
         return np.concatenate(known)[_order(beyond)] if known else np.empty((0, dim, dim))
 

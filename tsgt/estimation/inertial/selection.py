@@ -54,6 +54,11 @@ CONTRADICTION_S = 0.4
 wrong measurement contradicts for no longer: those of the other prisms follow.
 """
 
+MAX_WITNESS_AGE_S = 1.0
+"""Of the newest measurement, for the trajectory without IMU to tell that the one with it is wrong: in an outage no trajectory becomes
+certain or is lost.
+"""
+
 NO_TRAJECTORY_S = 10.0
 """Three stations that had no trajectory for so long are not expected to have one soon."""
 
@@ -133,6 +138,7 @@ class ImuSelector:
         self._now_s = self._driven_s = -np.inf  # Of the newest call, and of the newest sample of the wheels
         self._newest_s = self._usable_from_s = self._next_comparison_s = -np.inf
         self._contradicted_from_s = np.inf
+        self._measured_s = -np.inf  # Newest measurement
         self._no_trajectory_from_s: float | None = None
         self._nis = (0.0, 0.0)  # of the predicted and of a smoothed pose
         self._contradiction = ""
@@ -218,6 +224,7 @@ class ImuSelector:
 
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time."""
+        self._measured_s = max(self._measured_s, float(new.time_s[-1]))
         # A window that replaces another starts with the samples since; measurements from before still arrive.
         within = new.time_s >= self._with.horizon_s
         if within.any():
@@ -339,7 +346,8 @@ class ImuSelector:
         self._contradiction = self._contradiction or self._with.setup_doubt or self._with.health or ""
         if self._contradiction:
             return True
-        if self.use != ImuUse.USED or (self._with.converged and not self._with.ambiguous):
+        consistent = self._with.converged and not self._with.ambiguous
+        if self.use != ImuUse.USED or consistent or now_s - self._measured_s > MAX_WITNESS_AGE_S:
             self._contradicted_from_s = np.inf
             return False
         self._contradicted_from_s = min(self._contradicted_from_s, now_s)

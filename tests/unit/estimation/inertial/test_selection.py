@@ -295,14 +295,21 @@ def sound_window(*, measured_prisms: int = 3) -> SimpleNamespace:
         followed_for_s=0.0,
         measured_prisms=measured_prisms,
         add_samples=lambda _: None,
+        horizon_s=0.0,
+        update=lambda _: None,
     )
+
+
+def measured(time_s: float) -> Any:
+    """Return a measurement of which windows take nothing but its time."""
+    return SimpleNamespace(time_s=np.array([time_s]))
 
 
 @pytest.fixture
 def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace, SimpleNamespace]:
     """Return what chooses, a window with IMU, and the monitor of its set-up; all is well."""
     monkeypatch.setattr(ImuSelector, "_compare", lambda *_: None)
-    without = SimpleNamespace(converged=True, ambiguous=False)
+    without = SimpleNamespace(converged=True, ambiguous=False, update=lambda _: None)
     window = sound_window()
     setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="")
     setup.restart = lambda: vars(setup).update(confirmed=False)
@@ -317,9 +324,10 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace
 
 
 def uses_of(selector: ImuSelector, from_s: float, until_s: float) -> list[tuple[ImuUse, float]]:
-    """Choose ten times a second; return each use, and for how long."""
+    """Measure and choose ten times a second; return each use, and for how long."""
     uses = []
     for number in range(round(10 * from_s), round(10 * until_s)):
+        selector.update(measured(0.1 * number))
         selector.add_samples(imu_samples(20 * number, count=20))
         selector.take_samples()
         selector.choose(0.1 * (number + 1))
@@ -575,6 +583,28 @@ def test_three_stations_of_which_one_measures_are_contradicted_until_the_others_
         selector.choose(0.5 * (number + 1))
         found.append(selector.station_contradicted)
     assert found == [False] * 12 + [True] * 6 + [False] * 2
+
+
+@pytest.mark.parametrize(("measured_until_s", "use"), [(1.5, ImuUse.USED), (10.0, ImuUse.DISAGREES)])
+def test_trajectory_without_imu_tells_nothing_in_an_outage(measured_until_s: float, use: ImuUse) -> None:
+    """The one with it began just before, and has not become certain since."""
+    without = SimpleNamespace(converged=True, ambiguous=False, update=lambda _: None)
+    window = sound_window()
+    selector = ImuSelector(IMU_PARAMETERS, cast("Any", without), lambda _: cast("Any", window))
+    selector.begin(START)
+    selector._next_comparison_s = np.inf
+    uses = []
+    for number in range(40):
+        now_s = 0.1 * (number + 1)
+        if now_s < measured_until_s:
+            selector.update(measured(now_s))
+        window.ambiguous = number >= 26
+        selector.add_samples(imu_samples(20 * number, count=20))
+        selector.take_samples()
+        selector.choose(now_s)
+        uses.append(selector.use)
+    assert uses[26] == ImuUse.USED
+    assert uses[-1] == use
 
 
 def test_disagreement_before_the_imu_fell_silent_counts(

@@ -2,7 +2,8 @@
 
 A sample arrives after a delay that varies above a minimum, so that "arrival less device time" lies above a line, the lower
 envelope. Only the fastest samples shape it: a burst that arrives late changes nothing. None can arrive early: samples
-below the envelope mean that the device's clock was set.
+below the envelope mean that the device's clock was set. Where it was set back by little, or the host's was slewed by NTP, all
+samples of some seconds are late by the same.
 
 The skew of a crystal is below 0.1 %, so that some samples tell the time. A clock whose samples show more, that of a ceramic
 resonator, has the bounds of a counter, 5 %. One beyond these is no clock: it is never initialised.
@@ -43,6 +44,12 @@ _DELAY_CAP = 4.0  # a delay counts as at most this many mean delays: a stall say
 STEP_NS = 3_000_000
 """A sample this far below the envelope is not a faster one."""
 
+_LATE_NS = 2e9
+_LATE_SPREAD_NS = 1_500_000
+"""All samples are late when the fastest ones of both halves of this time lie :data:`STEP_NS` above the envelope, and one from the
+other no farther than this. Delays scatter, and those of a stall become shorter.
+"""
+
 _CANDIDATES = 3  # this many in a row replace the envelope
 
 _REFIT_NS = 1e9
@@ -70,7 +77,7 @@ class DeviceClock:
     """Fits the lower envelope of one device.
 
     ``counter``: the device's times are counts times the nominal period, whose rate may be off by percents. ``steps``: how
-    often samples below the envelope have replaced it.
+    often samples below the envelope, or above it all the time, have replaced it.
     """
 
     def __init__(self, *, counter: bool = False) -> None:
@@ -133,6 +140,11 @@ class DeviceClock:
         if x - self._fitted_x > (_REFIT_LOWER_NS if above < 0 else _REFIT_NS):
             before = self._line(x)
             self._fit()
+            if self._are_late:
+                while self._bins[0].x < x - _LATE_NS:
+                    self._bins.popleft()
+                self._fit()
+                self.steps += abs(before - self._line(x)) > _MAX_SLEWED_NS
             self._correction += before - self._line(x)
             self._fitted_x = x
             if self._is_no_clock:
@@ -228,6 +240,20 @@ class DeviceClock:
         if not self._wide and self._has_shown_more(points, mean[0], samples):
             self._widen()
             self._solve(points, mean[0], samples)
+
+    @property
+    def _are_late(self) -> bool:
+        """Whether the newest samples are late by the same, so that the samples before tell another time."""
+        newest = self._bins[-1].x
+        middle = newest - _LATE_NS / 2
+        if self._bins[0].x > newest - _LATE_NS:
+            return False
+        recent = [each for each in self._bins if each.x > newest - _LATE_NS]
+        halves = [each for each in recent if each.x <= middle], [each for each in recent if each.x > middle]
+        if not all(halves):
+            return False
+        first, second = (min(each.y - self._line(each.x) for each in half) for half in halves)
+        return min(first, second) > STEP_NS and abs(first - second) < _LATE_SPREAD_NS
 
     def _has_shown_more(self, points: list[tuple[float, float]], centre: float, samples: int) -> bool:
         """Whether fits of some seconds have shown a skew beyond the bound of a clock."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
 
 import structlog
 
@@ -24,28 +24,41 @@ if TYPE_CHECKING:
 log = structlog.get_logger()
 
 
+class _Driven(NamedTuple):
+    """One sample; ``speed_mps`` by the device's clock, where it gives distances."""
+
+    speed_mps: float
+    distance_m: float | None
+    yaw_rate_radps: float | None
+    valid: bool
+
+
 class OdometrySampler(DeviceSampler[OdometryLine, OdometrySamples]):
     """Assigns times to the samples; values are speed, yaw rate if there is one, and validity."""
 
-    def _values(self, line: OdometryLine, index: int, duration_ns: int) -> tuple[float, float | None, bool]:
+    def _values(self, line: OdometryLine, index: int, duration_ns: int) -> _Driven:
         if line.speed_mps is not None:
-            speed = line.speed_mps[index]
+            speed, distance = line.speed_mps[index], None
         else:
             assert line.distance_m is not None  # noqa: S101 (a line has one of both)
-            speed = line.distance_m[index] / (duration_ns / 1e9)
+            distance = line.distance_m[index]
+            speed = distance / (duration_ns / 1e9)
         check_speed(speed)
         rate = None if line.yaw_rate_radps is None else line.yaw_rate_radps[index]
-        return speed, rate, line.valid is None or line.valid[index]
+        return _Driven(speed, distance, rate, line.valid is None or line.valid[index])
 
-    def _record_of(
-        self, times: RecordTimes, values: Sequence[tuple[float, float | None, bool]]
-    ) -> OdometrySamples:
-        rates = [rate for _, rate, _ in values if rate is not None]
+    def _record_of(self, times: RecordTimes, values: Sequence[_Driven]) -> OdometrySamples:
+        rates = [each.yaw_rate_radps for each in values if each.yaw_rate_radps is not None]
+        # The encoder counts metres, whatever the device's clock takes for a second.
+        speeds = (
+            each.speed_mps if each.distance_m is None else each.distance_m / (duration_ns / 1e9)
+            for each, duration_ns in zip(values, times.duration_ns, strict=True)
+        )
         return OdometrySamples(
             **times._asdict(),
-            speed_mps=tuple(speed for speed, _, _ in values),
+            speed_mps=tuple(speeds),
             yaw_rate_radps=tuple(rates) if len(rates) == len(values) else None,
-            valid=tuple(valid for _, _, valid in values),
+            valid=tuple(each.valid for each in values),
         )
 
 

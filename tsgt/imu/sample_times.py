@@ -11,6 +11,9 @@ from typing import NamedTuple
 
 _REMEMBERED = 512  # samples that are recognised when they are printed again
 
+_MAX_REPEATED = 256
+"""More in succession, or all since the device began, are no line that is printed again: the device has begun again."""
+
 _BASELINE = 1000  # samples after which the period is known to 1e-5 and better
 
 _GAP_TOLERANCE_NS = 2e6
@@ -51,26 +54,32 @@ class SampleTimes:
             None  # counter and clock of the first sample since the last restart
         )
         self._recent: deque[tuple[int | None, int | None]] = deque(maxlen=_REMEMBERED)
+        self._count = self._repeated = 0  # samples since the last restart, and repeats in succession
 
     def push(self, counter: int | None, instrument_time_ns: int | None) -> SampleTime | None:
         """Take the next sample, with at least one of both; None for a recent sample once more."""
         found = self._push(counter, instrument_time_ns)
         if found is not None and found.restarted:
+            self._count = 0
             given = counter is not None and instrument_time_ns is not None
             self._origin = (counter or 0, instrument_time_ns or 0) if given else None
+        self._count += found is not None
         return found
 
     def _push(self, counter: int | None, instrument_time_ns: int | None) -> SampleTime | None:
         sample = (counter, instrument_time_ns)
         last = self._last
         if last is not None and _not_after(sample, last) and sample in self._recent:
+            self._repeated += 1
             return None
+        began_again = self._repeated >= min(self._count, _MAX_REPEATED) > 0
+        self._repeated = 0
         self._last = sample
         self._recent.append(sample)
         period_ns = round(self._period_ns)
         end_ns = round((counter or 0) * self._period_ns) if instrument_time_ns is None else instrument_time_ns
         restart = SampleTime(end_ns, period_ns, 0, restarted=True)
-        if last is None:
+        if last is None or began_again:
             return restart
         before, time_before_ns = last
         if (before is None) != (counter is None) or (time_before_ns is None) != (instrument_time_ns is None):

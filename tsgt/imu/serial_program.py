@@ -56,18 +56,18 @@ class Port:
         Raises SystemExit at the end of stdin, and InstrumentError when the device is gone.
         """
         ready, _, _ = select.select([self._port.fileno(), self._stdin], [], [], timeout_s)
-        at_ns = time.monotonic_ns()
         if self._stdin in ready and not os.read(self._stdin, _READ_BYTES):
             raise SystemExit(0)
         if self._port.fileno() not in ready:
-            return b"", at_ns
+            return b"", time.monotonic_ns()
         try:
             data = os.read(self._port.fileno(), _READ_BYTES)
         except OSError as error:
             raise InstrumentError(f"{self.name}: the device is gone: {error}") from error
         if not data:
             raise InstrumentError(f"{self.name}: the device is gone")
-        return data, at_ns
+        # Not before the bytes are read: others may arrive meanwhile, and a time that is early displaces all those after.
+        return data, time.monotonic_ns()
 
 
 def run(device: Device, port: Port, rate_hz: int, put: Callable[[bytes], None]) -> None:

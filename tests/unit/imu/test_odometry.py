@@ -12,10 +12,13 @@ from harness.instruments.bridge import FakeStart
 from tsgt.clock import UnixTimeline
 from tsgt.config import OdometryConfig
 from tsgt.imu import WheelOdometry, decode_odometry_line
+from tsgt.imu.odometry import OdometrySampler
+from tsgt.imu.odometry_lines import OdometryHelloLine, OdometryLine
 from tsgt.simulation.kernel import VirtualClock, run_virtual
 
 HELLO = {"type": "hello", "odometry": 1, "make": "Acme", "rate_hz": 20.0}
 START_NS = 50 * 10**9
+MS = 1_000_000
 
 
 def samples(first: int, **changes: Any) -> dict[str, Any]:
@@ -68,6 +71,22 @@ def test_distances_become_speeds_with_times() -> None:
     assert records[0].valid[:2] == (True, False)
     assert records[0].yaw_rate_radps is None
     assert events == ["odometry_lost"]
+
+
+def test_distance_is_that_of_the_wheels_whatever_the_clock_of_the_device() -> None:
+    """A clock that is 3 % fast makes the device's seconds shorter, not the way."""
+    sampler = OdometrySampler(0)
+    sampler.program_started(OdometryHelloLine(odometry=1, make="x", rate_hz=20.0))
+    records = [
+        record
+        for number in range(1, 400)
+        for record in sampler.push(
+            OdometryLine(instrument_time_ns=(round(number * 51.5 * MS),), distance_m=(0.05,)),
+            START_NS + number * 50 * MS,
+        )
+    ]
+    assert records[-1].duration_ns[0] == pytest.approx(50 * MS, rel=1e-4)
+    assert records[-1].speed_mps[0] == pytest.approx(1.0, rel=1e-4)
 
 
 def test_slow_counter_without_a_clock_is_not_restarted() -> None:

@@ -77,3 +77,19 @@ def test_clock_set_in_a_gap(step_ns: int, restarted: bool) -> None:  # noqa: FBT
 def test_repeated_sample_is_none() -> None:
     """The same counter and time."""
     assert pushed((1, 5 * MS), (1, 5 * MS)) == [None]
+
+
+def test_line_printed_again_is_no_restart() -> None:
+    """The samples after it follow those before."""
+    line = [(counter, counter * 5 * MS) for counter in range(20)]
+    found = pushed(*line, *line[10:], (20, 100 * MS))
+    assert found[-1] == SampleTime(100 * MS, 5 * MS, 0, False)
+
+
+@pytest.mark.parametrize("count", [60, 400])
+def test_device_that_begins_again_soon_has_restarted(count: int) -> None:
+    """Its samples have the numbers and times of those before, in the same order; the next one is not the successor of those."""
+    first = [(counter, counter * 5 * MS) for counter in range(count)]
+    *again, found = pushed(*first, *first, (count, count * 5 * MS))[count - 1 :]
+    assert again == [None] * count
+    assert found == SampleTime(count * 5 * MS, 5 * MS, 0, True)

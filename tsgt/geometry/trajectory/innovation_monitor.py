@@ -110,13 +110,14 @@ class InnovationMonitor:
         self._inconsistent_from_s = time_s
         self._needs_two_prisms |= needs_two_prisms
 
-    def set_unproven(self, time_s: float, prisms: frozenset[int], *, needs_two_prisms: bool) -> None:
-        """Mark the state as ambiguous from a measurement on that a wrong prism could have given as well.
+    def set_unproven(self, known_until_s: float, prisms: frozenset[int], *, needs_two_prisms: bool) -> None:
+        """Mark the state as ambiguous because of a measurement after an outage that a wrong prism could have given as well.
 
+        ``known_until_s``: time of the last measurement before it; all states since rest on the one after it, too.
         ``needs_two_prisms``: until two prisms agree, however often one does with itself.
         """
         if not self.inconsistent_prisms:
-            self._inconsistent_from_s, self.followed_for_s = time_s, 0.0
+            self._inconsistent_from_s, self.followed_for_s = known_until_s + AMBIGUITY_MARGIN_S, 0.0
         self.inconsistent_prisms |= prisms
         self._consistent_prisms, self._succession = frozenset(), 0
         self._needs_two_prisms = needs_two_prisms

@@ -263,6 +263,8 @@ def test_measurement_after_an_outage_is_confirmed_by_another_prism(stations: int
     for row in first:
         live.measure(observations.select(slice(row, row + 1)))
         assert live.window.ambiguous
+        # Smoothed states in the outage rest on it, too.
+        assert live.window.ambiguous_from_s <= 5.0
     row = int(np.flatnonzero((observations.prism == 1) & (np.arange(len(observations)) > first[-1]))[0])
     live.measure(observations.select(slice(row, row + 1)))
     assert live.window.converged

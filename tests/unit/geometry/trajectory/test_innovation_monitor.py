@@ -172,7 +172,7 @@ def test_measurements_after_an_outage_are_unproven(text: str, *, needs_two: bool
     monitor = _monitor_after("ab", alone=3)
     assert not monitor.inconsistent_prisms
     monitor.set_unproven(5.0, frozenset({0}), needs_two_prisms=needs_two)
-    assert monitor.ambiguous_from_s == 5.0 - AMBIGUITY_MARGIN_S
+    assert monitor.ambiguous_from_s == 5.0
     for each in text:
         wrong = np.array([each.isupper()])
         monitor.select(np.zeros(len(monitor._time_s), np.bool_))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tsgt.geometry.trajectory import Observations
-from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
+from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
 
 BY_CHANCE, IN_RAIN, NOT_BY_CHANCE = 20.0, 38.0, 60.0  # NIS of inconsistent measurements
 OWN_PRISM_M, WRONG_PRISM_M = 0.02, 0.5  # Residuals

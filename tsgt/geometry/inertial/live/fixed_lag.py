@@ -475,9 +475,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
         _, covariance = self._predict(first_s, POSE_DIM)
         if np.trace(covariance[0, :3, :3]) > UNPROVEN_SIGMA_M**2:
             prisms = frozenset(new.prism.tolist())
-            self._monitor.set_unproven(
-                self._predictor.time_s, prisms, needs_two_prisms=len(new.layout) > 1
-            )
+            self._monitor.set_unproven(self._predictor.time_s, prisms, needs_two_prisms=len(new.layout) > 1)
 
     def _window_with(self, time_s: FloatArray) -> KnotWindow:
         """Return the window with knots at measurement times that have none nearby, and with the samples that have arrived."""

@@ -5,7 +5,7 @@
 
 The missions of the benchmark imu, replayed as they arrived to a live estimator whose IMU is set up wrongly, as in the
 benchmark imu_setup, or whose station 1 moves 60 s after the first measurement (by 10, 20 or 50 mm, 0.5 mrad; named: the first pose that is
-`contradicted`). Per error: when the IMU is confirmed and when an event names a cause (s after the first measurement); then for
+`contradicted`, or degraded by `imu_disagrees`). Per error: when the IMU is confirmed and when an event names a cause (s after the first measurement); then for
 predicted and for smoothed poses, over the whole drive: the share that is valid, the share of these that rests on the IMU, rms errors of
 the prisms' centroid in mm and of the rotation in degrees, mean NEES, and the share of valid poses whose position or rotation is beyond
 three sigmas (0.0027 expected of each).
@@ -51,15 +51,13 @@ def tilted(measurement: PolarMeasurement) -> PolarMeasurement:
     return replace(measurement, zenith_angle_rad=measurement.zenith_angle_rad + float(lifted_rad))
 
 
-def moved(by_m: float, measurement: PolarMeasurement) -> PolarMeasurement:
-    """Move the tripod by a distance, horizontally."""
+def moved(by_m: Sequence[float], measurement: PolarMeasurement) -> PolarMeasurement:
+    """Move the tripod by a vector in its frame."""
     if measurement.slope_distance_m is None:
         return measurement
     azimuth, zenith = measurement.horizontal_angle_rad, measurement.zenith_angle_rad
     direction = [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
-    x, y, z = measurement.slope_distance_m * np.array(direction) - by_m * np.array(
-        [np.sqrt(0.5), np.sqrt(0.5), 0.0]
-    )
+    x, y, z = measurement.slope_distance_m * np.array(direction) - by_m
     distance_m = float(np.sqrt(x * x + y * y + z * z))
     return replace(
         measurement,
@@ -72,7 +70,11 @@ def moved(by_m: float, measurement: PolarMeasurement) -> PolarMeasurement:
 FAULTS: dict[str, Callable[[PolarMeasurement], PolarMeasurement]] = {
     "tripod turned": turned,
     "tripod tilted": tilted,
-    **{f"tripod moved {by_mm} mm": partial(moved, by_mm / 1000) for by_mm in (10, 20, 50)},
+    **{
+        f"tripod moved {by_mm} mm": partial(moved, [by_mm / 1000 * np.sqrt(0.5)] * 2 + [0.0])
+        for by_mm in (10, 20, 50)
+    },
+    "tripod sunk 20 mm": partial(moved, [0.0, 0.0, -0.02]),
 }
 ERRORS = ("none", *CONFIGURED, *SAMPLED, *FAULTS)
 THREE_SIGMA_3D = 14.156
@@ -230,7 +232,11 @@ def main() -> None:
                 }
                 confirmed, named = (next(iter(each), "-") for each in times.values())
                 if name in FAULTS:
-                    contradicted = [each.stamp_ns for each in poses if each.reason == "contradicted"]
+                    contradicted = [
+                        each.stamp_ns
+                        for each in poses
+                        if each.reason == "contradicted" or "imu_disagrees" in each.degraded_by
+                    ]
                     named = f"{(min(contradicted) - first_ns) / 1e9:.1f}" if contradicted else "-"
                 columns = [
                     figures([each for each in poses if each.series == series], truth)

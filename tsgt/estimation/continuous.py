@@ -304,6 +304,8 @@ class ContinuousEstimator:
             if self._imu.station_contradicted:
                 batch.reason[batch.valid] = Reason.CONTRADICTED
                 batch.degraded[:] = 0
+            if self._imu.disagrees:
+                batch.degraded[batch.valid] |= Degradation.IMU_DISAGREES
             if self._imu.unconfirmed:
                 # Over an outage what is wrong in the set-up grows far beyond the allowance.
                 unseen = batch.valid & (batch.prism_reason != int(Reason.VALID)).all(axis=1)

@@ -46,6 +46,7 @@ class Degradation(IntFlag):
     AMBIGUOUS = 8
     RESIDUAL = 16
     IMU_UNCONFIRMED = 32
+    IMU_DISAGREES = 64
 
 
 @functools.cache

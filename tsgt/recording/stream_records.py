@@ -36,7 +36,13 @@ Reason = Literal[
 ]
 Quality = Literal["good", "degraded", "invalid"]
 Degradation = Literal[
-    "prism_missing", "old_measurements", "uncertain", "ambiguous", "residual", "imu_unconfirmed"
+    "prism_missing",
+    "old_measurements",
+    "uncertain",
+    "ambiguous",
+    "residual",
+    "imu_unconfirmed",
+    "imu_disagrees",
 ]
 ImuUse = Literal["used", "starting", "silent", "disagrees", "wrong_setup", "unconfirmed"]
 OdometryUse = Literal["used", "silent", "disagrees", "without_imu"]
@@ -220,7 +226,8 @@ class PoseRecord(FiniteNumbers):
     measured), ``old_measurements`` (a prediction whose newest measurement is older than three quarters of the outage limit), ``uncertain`` (a sigma is
     above half its limit), ``ambiguous`` (measurements contradicted each other up to 1.5 s before), ``residual``
     (``residual_m`` is above half its limit), ``imu_unconfirmed`` (it rests on an IMU whose set-up no drive has confirmed yet;
-    the covariance allows for that)."""
+    the covariance allows for that), ``imu_disagrees`` (an IMU that was used disagrees with the prisms: it, a tripod or a prism may have
+    moved; until the IMU is used again, or the master takes another set-up)."""
     residual_m: float | None
     """Root mean square over the prisms of their distance in m from the fitted layout; null without a fit."""
     stations: tuple[StationShare, ...]

@@ -16,7 +16,7 @@ import numpy as np
 from tsgt.estimation.inertial.samples import SampleConverter
 from tsgt.estimation.inertial.wheels import WheelConverter
 from tsgt.estimation.pose_batch import ImuUse
-from tsgt.geometry.inertial import DISAGREES_WITH_PRISMS
+from tsgt.geometry.inertial import DISAGREES_WITH_PRISMS, SHOCK
 from tsgt.geometry.trajectory import POSE_DIM
 from tsgt.model import MIN_PRISMS
 
@@ -107,7 +107,8 @@ class ImuSelector:
     first, and another after each disagreement.
     ``setup``: monitors the set-up of the IMU; None: nothing does. ``prisms``: of the layout. ``use``: whether poses rest on the
     IMU, and why not. ``station_contradicted``: whether the IMU has contradicted one or two stations, and the trajectory follows them
-    nevertheless, because nothing tells which of the two is wrong.
+    nevertheless, because nothing tells which of the two is wrong. ``disagrees``: whether an IMU that was used has turned out to disagree with
+    the prisms, without a shock, and has not been used since: it, a tripod or a prism may have moved.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class ImuSelector:
         self._without = without
         self._create_with = create_with
         self._setup, self._prisms = setup, prisms
-        self._established = self.station_contradicted = False
+        self._established = self.station_contradicted = self.disagrees = False
         # The trajectory with the IMU, since it was found
         self._was_consistent = self._was_ambiguous = False
         self._start_prisms = 1
@@ -250,6 +251,8 @@ class ImuSelector:
             if found == ImuUse.DISAGREES and uncertain and self._setup is not None:
                 self._setup.restart()
             if self.use == ImuUse.USED:
+                wrong = uncertain or found == ImuUse.WRONG_SETUP
+                self.disagrees |= wrong and self._with.setup_doubt != SHOCK
                 again = now_s - self._used_from_s < PROVEN_S
                 # With fewer than three prisms there are no poses meanwhile.
                 longer = 2 if uncertain or self._prisms >= MIN_PRISMS else 1
@@ -272,6 +275,7 @@ class ImuSelector:
             self._update_without()
         elif self.use != ImuUse.USED:
             self._used_from_s = now_s
+            self.disagrees = False
         self.use = found
 
     def marginalise_before(self, before_s: float) -> None:

@@ -82,6 +82,8 @@ _REMEDIES: dict[Cause, str] = {
     "latency": "calibrate it: tsgt calibrate imu; or check the clock of the computer that stamps the samples",
     "unrelated": "check which device the program reads, and its clock",
 }
+_MOVED: frozenset[Cause] = frozenset({"rotation", "position"})
+_REMEDY_IF_MOVED = "it was right before, so the IMU, a tripod or a prism has moved: tsgt calibrate check tells whether it was a tripod"
 
 
 def start_now(work: Callable[[], SetupCheck]) -> Callable[[], SetupCheck]:
@@ -179,7 +181,7 @@ class ImuSetupMonitor:
         self._result_ns = 0
         self._watched_until_ns: int | None = None
         self._standing: dict[Cause, SetupFinding] = {}
-        self._confirmed = self._displaced = False
+        self._confirmed = self._was_confirmed = self._displaced = False
         self._open = tuple(_PARTS.values())
         self._events: list[EventRecord] = []
 
@@ -243,6 +245,7 @@ class ImuSetupMonitor:
         )
         if shocks.any():
             self._displaced |= few_prisms
+            self._was_confirmed = False
         if shocks.any() or (few_prisms and unwatched):
             self.restart()
         self._records.append(record)
@@ -263,13 +266,14 @@ class ImuSetupMonitor:
             del self._standing[cause]
         for finding in check.findings:
             if finding.cause not in self._standing:
-                message = f"{finding.text}; {_REMEDIES[finding.cause]}"
+                has_moved = self._was_confirmed and finding.cause in _MOVED
+                message = f"{finding.text}; {_REMEDY_IF_MOVED if has_moved else _REMEDIES[finding.cause]}"
                 self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_wrong", message=message))
             self._standing[finding.cause] = finding
         if self._standing:
             self._confirmed = False
         elif not self._confirmed and check.confirmed and not self._displaced:
-            self._confirmed = True
+            self._confirmed = self._was_confirmed = True
             self._next_ns = now_ns + INTERVAL_NS
             message = _CONFIRMATION_BY_PRISMS.get(len(self._parameters.prisms), _CONFIRMATION)
             self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_confirmed", message=message))

@@ -8,6 +8,7 @@ from tsgt.geometry.inertial.anchor import InertialAnchor
 from tsgt.geometry.inertial.initialisation import search_heading, states_on_tracks
 from tsgt.geometry.inertial.live import (
     DISAGREES_WITH_PRISMS,
+    SHOCK,
     InertialFixedLagSmoother,
     SaturationMonitor,
     judge_magnitudes,
@@ -37,6 +38,7 @@ from tsgt.geometry.inertial.states import (
 
 __all__ = [
     "DISAGREES_WITH_PRISMS",
+    "SHOCK",
     "ContiguousSamples",
     "Gravity",
     "InertialAnchor",

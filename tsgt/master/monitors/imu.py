@@ -25,7 +25,7 @@ AGREED_STATUSES = 5
 _CAUSES = {
     "starting": "its trajectory is not certain enough",
     "silent": "there is no sample",
-    "disagrees": "it disagrees with the measurements of the prisms",
+    "disagrees": "it disagrees with the measurements of the prisms, because its samples are wrong, or it, a tripod or a prism has moved",
     "wrong_setup": "its set-up is wrong",
     "unconfirmed": "its set-up is not confirmed by driving yet: drive curves, accelerate and brake",
 }

@@ -181,6 +181,7 @@ def degradations(
         "old_measurements": "the pose rests on old measurements",
         "ambiguous": "measurements contradict each other",
         "imu_unconfirmed": UNCONFIRMED,
+        "imu_disagrees": "the IMU disagrees with the prisms: IMU, tripod or prism moved? Check the tripods first",
         "residual": "the prisms nearly miss their layout: tripod or prism moved?",
         "uncertain": _uncertain(smoothed or pose, limits),
     }

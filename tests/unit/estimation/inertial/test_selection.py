@@ -25,7 +25,7 @@ from tsgt.estimation.inertial.selection import (
     ImuState,
 )
 from tsgt.estimation.pose_batch import ImuUse
-from tsgt.geometry.inertial import WheelsEstimate
+from tsgt.geometry.inertial import SHOCK, WheelsEstimate
 from tsgt.geometry.inertial_calibration import SetupCheck, SetupFinding
 from tsgt.geometry.trajectory import FixedLagSmoother
 from tsgt.model import ImuSamples, Measurement, OdometryParameters, OdometrySamples, Status
@@ -638,6 +638,32 @@ def test_trajectory_that_was_never_consistent_contradicts_no_station(
         selector.take_samples()
         selector.choose(0.5 * (number + 1))
     assert selector.station_contradicted == contradicted
+
+
+@pytest.mark.parametrize(
+    ("health", "doubt", "disagrees"),
+    [(DISAGREES, DISAGREES, True), (SHOCK, SHOCK, False), (STUCK, "", False)],
+)
+def test_imu_that_disagreed_without_a_shock_degrades_the_poses_without_it(
+    scene: Scene, health: str, doubt: str, *, disagrees: bool
+) -> None:
+    """It, a tripod or a prism may have moved, until it is used again."""
+    live = checked(scene)
+    poses = []
+    for each in arrivals(scene, 24.0):
+        window = FakeInertialSmoother.created[-1] if FakeInertialSmoother.created else None
+        if window is not None and 9.9 < (each.received_ns - START) / SECOND < 10.0:
+            window.health, window.setup_doubt = health, doubt
+        found = live.imu_samples(each) if isinstance(each, ImuSamples) else live.measurement(each)
+        poses += predicted(list(found))
+    by_use = {
+        use: {"imu_disagrees" in pose.degraded_by for pose in poses if pose.valid and pose.imu == use}
+        for use in ("used", "disagrees", "unconfirmed")
+    }
+    assert by_use["used"] == {False}
+    assert by_use["disagrees"] == {disagrees}
+    assert time_of(poses[-1]) > 23.0
+    assert poses[-1].imu == "used"
 
 
 def test_poses_of_a_contradicted_station_are_invalid(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

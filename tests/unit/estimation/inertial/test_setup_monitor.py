@@ -116,6 +116,18 @@ def test_knock_after_confirmation_is_reported() -> None:
     assert not monitored.monitor.confirmed
 
 
+@pytest.mark.parametrize("is_shock", [True, False])
+def test_setup_that_becomes_wrong_without_a_shock_may_be_a_tripod(*, is_shock: bool) -> None:
+    """A tripod that sinks tilts what the prisms tell, as if the IMU had turned."""
+    monitored = Monitored([RIGHT, wrong("rotation")])
+    monitored.run(20)
+    if is_shock:
+        monitored.monitor.samples(shock(monitored.samples))
+    (event,) = monitored.run(40)
+    assert ("a tripod or a prism has moved" in event.message) is not is_shock
+    assert ("tsgt calibrate imu" in event.message) is is_shock
+
+
 @pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
 def test_few_prisms_do_not_confirm_after_a_blow(prisms: int, *, confirmed: bool) -> None:
     """A drive does not show them all rotations by which the shock may have turned the IMU."""

@@ -7,11 +7,17 @@ samples end; `known_rotation` carries a rotation over a loss.
 """
 
 from tsgt.geometry.inertial.live.fixed_lag import InertialFixedLagSmoother
-from tsgt.geometry.inertial.live.health import DISAGREES_WITH_PRISMS, judge_magnitudes, usable_samples
+from tsgt.geometry.inertial.live.health import (
+    DISAGREES_WITH_PRISMS,
+    SHOCK,
+    judge_magnitudes,
+    usable_samples,
+)
 from tsgt.geometry.inertial.live.saturation import SaturationMonitor
 
 __all__ = [
     "DISAGREES_WITH_PRISMS",
+    "SHOCK",
     "InertialFixedLagSmoother",
     "SaturationMonitor",
     "judge_magnitudes",

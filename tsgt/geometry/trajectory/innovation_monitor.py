@@ -43,7 +43,8 @@ class InnovationMonitor:
     prism of a layout is followed even if all of its inconsistent measurements stay outliers, unless they are of a wrong prism:
     within two seconds biases and tilt let a trajectory move by some centimetres unnoticed. ``lost_after_s``: the same time of the
     ambiguity in which the trajectory was lost, followed or not, until one is resolved again.
-    After an outage the state may be ambiguous though all is consistent (:meth:`set_unproven`).
+    All states in an outage rest on the measurement after it (:meth:`set_outage`), so that they are ambiguous with that. It may make the state
+    ambiguous though all is consistent (:meth:`set_unproven`).
     """
 
     def __init__(self, alone: int | None = None) -> None:
@@ -61,6 +62,7 @@ class InnovationMonitor:
         self._largest_nis: dict[int, float] = {}
         self._inconsistent_s: dict[int, tuple[float, float]] = {}  # First and last one, followed or not
         self._ambiguous_intervals_s: list[tuple[float, float]] = []
+        self._outage_s = (-np.inf, -np.inf)  # The newest one
         self.followed_for_s = self.lost_after_s = 0.0
 
     @property
@@ -110,14 +112,20 @@ class InnovationMonitor:
         self._inconsistent_from_s = time_s
         self._needs_two_prisms |= needs_two_prisms
 
-    def set_unproven(self, known_until_s: float, prisms: frozenset[int], *, needs_two_prisms: bool) -> None:
-        """Mark the state as ambiguous because of a measurement after an outage that a wrong prism could have given as well.
+    def set_outage(self, from_s: float, until_s: float) -> None:
+        """Note the times of the measurements before and after an outage of all prisms."""
+        self._outage_s = (from_s, until_s)
 
-        ``known_until_s``: time of the last measurement before it; all states since rest on the one after it, too.
-        ``needs_two_prisms``: until two prisms agree, however often one does with itself.
+    def set_unproven(self, time_s: float, prisms: frozenset[int], *, needs_two_prisms: bool) -> None:
+        """Mark the state as ambiguous from a measurement on that a wrong prism could have given as well.
+
+        ``needs_two_prisms``: until two prisms agree, however often one does with itself. They say nothing then of an ambiguity before an
+        outage, after which all agrees.
         """
         if not self.inconsistent_prisms:
-            self._inconsistent_from_s, self.followed_for_s = known_until_s + AMBIGUITY_MARGIN_S, 0.0
+            self._inconsistent_from_s, self.followed_for_s = self._since(time_s), 0.0
+        else:
+            self._ambiguous_intervals_s.append((self.ambiguous_from_s, time_s))
         self.inconsistent_prisms |= prisms
         self._consistent_prisms, self._succession = frozenset(), 0
         self._needs_two_prisms = needs_two_prisms
@@ -162,7 +170,7 @@ class InnovationMonitor:
         )
         for time_s, prism, is_flagged, nis in zip(*rows, strict=True):
             if not self.inconsistent_prisms:
-                self._inconsistent_from_s = time_s
+                self._inconsistent_from_s = self._since(time_s)
             if is_flagged:
                 self._largest_nis[prism] = max(nis, self._largest_nis.get(prism, 0.0))
                 self.inconsistent_prisms |= {prism}
@@ -189,13 +197,19 @@ class InnovationMonitor:
             self._inconsistent_s.clear()
             self.lost_after_s = 0.0
 
+    def _since(self, time_s: float) -> float:
+        """Return the time of a measurement or, if an outage has ended shortly before, of the one before that."""
+        from_s, until_s = self._outage_s
+        return from_s if until_s <= time_s < until_s + AMBIGUITY_MARGIN_S else time_s
+
     def _resolve(self) -> None:
         """Record the interval of an ambiguity that has just ended, unless its flagged measurements were rejected."""
         flagged = self._flagged
         single_prism = len(np.unique(self._prism[flagged])) == 1
         if self._followed.any() or (flagged.any() and not single_prism):
             times_s = self._time_s[flagged]
-            self._ambiguous_intervals_s.append((float(times_s[0]) - AMBIGUITY_MARGIN_S, float(times_s[-1])))
+            from_s = self._since(float(times_s[0])) - AMBIGUITY_MARGIN_S
+            self._ambiguous_intervals_s.append((from_s, float(times_s[-1])))
             self._extend(self._spans_s, self._followed)
         self.followed_for_s = self._longest_s(self._spans_s)
         self._flagged = self._followed = np.zeros_like(flagged)

@@ -262,13 +262,29 @@ def test_measurement_after_an_outage_is_confirmed_by_another_prism(stations: int
     first = later[observations.prism[later] == 0][:3]
     for row in first:
         live.measure(observations.select(slice(row, row + 1)))
-        assert live.window.ambiguous
         # Smoothed states in the outage rest on it, too.
         assert live.window.ambiguous_from_s <= 5.0
+        assert live.window.ambiguous
     row = int(np.flatnonzero((observations.prism == 1) & (np.arange(len(observations)) > first[-1]))[0])
     live.measure(observations.select(slice(row, row + 1)))
     assert live.window.converged
     assert not live.window.ambiguous
+
+
+@pytest.mark.slow
+def test_measurement_after_an_outage_is_unproven_beside_a_backlog() -> None:
+    """It comes together with what another station measured before the outage."""
+    observations = measurements()
+    live = Live()
+    live.measure(observations.select(observations.time_s < 5.0))
+    before = np.flatnonzero((observations.time_s > 5.0) & (observations.prism == 1))[0]
+    first = np.flatnonzero((observations.time_s > 9.0) & (observations.prism == 0))[0]
+    together = observations.select(np.array([before, first]))
+    live.sample_until(together.time_s[1] + DELAY_S)
+    live.window.update(together)
+    assert live.window.converged
+    assert live.window.ambiguous
+    assert live.window.ambiguous_from_s < together.time_s[0]
 
 
 @pytest.mark.slow

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tsgt.geometry.trajectory import Observations
-from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
+from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S, InnovationMonitor
 
 BY_CHANCE, IN_RAIN, NOT_BY_CHANCE = 20.0, 38.0, 60.0  # NIS of inconsistent measurements
 OWN_PRISM_M, WRONG_PRISM_M = 0.02, 0.5  # Residuals
@@ -172,7 +174,7 @@ def test_measurements_after_an_outage_are_unproven(text: str, *, needs_two: bool
     monitor = _monitor_after("ab", alone=3)
     assert not monitor.inconsistent_prisms
     monitor.set_unproven(5.0, frozenset({0}), needs_two_prisms=needs_two)
-    assert monitor.ambiguous_from_s == 5.0
+    assert monitor.ambiguous_from_s == 5.0 - AMBIGUITY_MARGIN_S
     for each in text:
         wrong = np.array([each.isupper()])
         monitor.select(np.zeros(len(monitor._time_s), np.bool_))
@@ -184,6 +186,49 @@ def test_measurements_after_an_outage_are_unproven(text: str, *, needs_two: bool
             np.zeros((1, 3)),
         )
     assert bool(monitor.inconsistent_prisms) is ambiguous
+
+
+@pytest.mark.parametrize("unproven", [True, False])
+@pytest.mark.parametrize(("time_s", "from_s"), [(5.0, 2.0), (6.4, 2.0), (6.6, 6.6)])
+def test_states_of_an_outage_are_ambiguous_with_the_measurement_after_it(
+    time_s: float, from_s: float, *, unproven: bool
+) -> None:
+    """They rest on it; also if it agrees, and if it is one soon after."""
+    monitor = _monitor_after("ab")
+    monitor.set_outage(2.0, 5.0)
+    if unproven:
+        monitor.set_unproven(time_s, frozenset({0}), needs_two_prisms=True)
+    else:
+        inconsistent = np.array([True])
+        monitor.select(np.zeros(4, np.bool_))
+        new = replace(_observations(0), time_s=np.array([time_s]))
+        monitor.update(new, inconsistent, BY_CHANCE * inconsistent, inconsistent, np.zeros((1, 3)))
+    assert monitor.ambiguous_from_s == from_s - AMBIGUITY_MARGIN_S
+
+
+def test_ambiguity_before_an_outage_is_not_resolved_after_it() -> None:
+    """What is right agrees with a wrong trajectory then, because that is uncertain."""
+    monitor = _monitor_after("ab")
+    monitor.set_unproven(5.0, frozenset({0}), needs_two_prisms=True)
+    monitor.set_outage(5.0, 11.0)
+    monitor.set_unproven(11.0, frozenset({0}), needs_two_prisms=True)
+    consistent = np.zeros(2, np.bool_)
+    monitor.select(np.zeros(4, np.bool_))
+    monitor.update(
+        replace(_observations(0, 1), time_s=np.array([11.0, 11.2])),
+        ~consistent,
+        np.zeros(2),
+        consistent,
+        np.zeros((2, 3)),
+    )
+    assert not monitor.inconsistent_prisms
+    assert monitor.ambiguous_at(np.array([3.4, 3.6, 8.0, 11.0, 11.1])).tolist() == [
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_ambiguity_without_inconsistent_measurements_follows_none() -> None:

@@ -73,8 +73,8 @@ CONSISTENT_ALONE = 5
 """Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
 each of them. A chance agreement of wrong ones within the gate, five times, is none.
 """
-UNPROVEN_GAP_S, UNPROVEN_SIGMA_M = 1.0, 0.05
-"""Time without measurements, and sigma of the position after it, from which on a wrong prism, some decimetres away, may agree."""
+UNPROVEN_GAP_S, UNPROVEN_SIGMA_M = 1.0, 0.02
+"""Time without measurements, and sigma of the position after it, from which on a wrong prism, two decimetres away, or a reflection may agree."""
 MAX_ROTATION_SQUARES = 20.0
 """Of the rotation of a start against that from before, normalised, three components; 2 in 10,000 exceed it."""
 WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
@@ -302,6 +302,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
     def update(self, new: Observations) -> None:
         """Process measurements, in the order of time, none before :attr:`horizon_s`."""
         self._health.advance(float(new.time_s[-1]))
+        while self._converged and (row := self._first_after_outage(new)):
+            super().update(new.select(slice(row)))
+            new = new.select(slice(row, None))
         if not self._converged:
             self._searched = merge_observations(self._searched, new)
         super().update(new)
@@ -309,6 +312,13 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._searched = None
         elif self._searched is None:
             self._searched = self.observations
+
+    def _first_after_outage(self, new: Observations) -> int:
+        """Return the first new measurement after an outage of all prisms that others precede, which arrived with it; 0 without one."""
+        assert self._predictor is not None  # noqa: S101 (converged)
+        before_s = np.maximum(new.time_s[:-1], self._predictor.time_s)
+        rows = np.flatnonzero(new.time_s[1:] - before_s >= UNPROVEN_GAP_S)
+        return int(rows[0]) + 1 if len(rows) else 0
 
     def _initialise(self, observations: Observations) -> None:
         self._converged, self._newest_nis = False, 0.0
@@ -472,10 +482,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
         first_s = float(new.time_s[0])
         if first_s - self._predictor.time_s < UNPROVEN_GAP_S:
             return
+        self._monitor.set_outage(self._predictor.time_s, first_s)
         _, covariance = self._predict(first_s, POSE_DIM)
         if np.trace(covariance[0, :3, :3]) > UNPROVEN_SIGMA_M**2:
             prisms = frozenset(new.prism.tolist())
-            self._monitor.set_unproven(self._predictor.time_s, prisms, needs_two_prisms=len(new.layout) > 1)
+            self._monitor.set_unproven(first_s, prisms, needs_two_prisms=len(new.layout) > 1)
 
     def _window_with(self, time_s: FloatArray) -> KnotWindow:
         """Return the window with knots at measurement times that have none nearby, and with the samples that have arrived."""

@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 import tsgt
-from tsgt.analysis.inertial_smoothing import MOVED_REMEDY, SHOCK_REMEDY
+from tsgt.analysis.inertial_smoothing import DISPLACEMENT_REMEDY, MOVED_REMEDY
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.refinement import Refine
@@ -275,11 +275,12 @@ def imu_text(found: SmoothedPoses) -> str | None:
     for reason, words in (
         ("gap", "without samples"),
         ("contradiction", "in contradiction to the measurements"),
+        ("unproven", "around a few measurements of one prism alone, which may be the wrong one"),
     ):
         seconds = sum(each.end_s - each.start_s for each in used.unused if each.reason == reason)
         text += f"; {seconds:.1f} s {words}" if seconds else ""
     if np.isfinite(used.displaced_from_s):
-        text += f"; from {used.displaced_from_s:.1f} s on a shock may have displaced it: {SHOCK_REMEDY}"
+        text += f"; from {used.displaced_from_s:.1f} s on a knock may have displaced it, because of a shock or of missing samples: {DISPLACEMENT_REMEDY}"
     if np.isfinite(used.moved_from_s):
         text += f"; from {used.moved_from_s:.1f} s on measurements contradict it: {MOVED_REMEDY}"
     return text

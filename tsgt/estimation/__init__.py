@@ -8,6 +8,7 @@ hold and validate poses; `reference_point` carries them to another point of the 
 
 from tsgt.estimation.inertial import (
     UNCONFIRMED_SIGMAS,
+    UNWATCHED_NS,
     ImuSetupMonitor,
     OdometryState,
     SampleConverter,
@@ -58,6 +59,7 @@ __all__ = [
     "MAX_DISTANCE_M",
     "POINT_COMMENT",
     "UNCONFIRMED_SIGMAS",
+    "UNWATCHED_NS",
     "ContinuousPoseOutput",
     "Degradation",
     "ImuSetupMonitor",

@@ -11,6 +11,7 @@ from tsgt.estimation.inertial.selection import (
     OdometryState,
 )
 from tsgt.estimation.inertial.setup_monitor import (
+    UNWATCHED_NS,
     ImuSetupMonitor,
     StartCheck,
     check_recorded_setup,
@@ -20,6 +21,7 @@ from tsgt.estimation.inertial.wheels import wheel_samples
 
 __all__ = [
     "UNCONFIRMED_SIGMAS",
+    "UNWATCHED_NS",
     "ImuSetupMonitor",
     "ImuState",
     "OdometryState",

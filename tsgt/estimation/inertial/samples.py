@@ -62,7 +62,8 @@ class SampleConverter:
         same = (values[1:] == values[:-1]).all(axis=1)
         # A device that is asked twice as often as it measures repeats each sample once, a stuck one goes on.
         stuck = same[1:] & same[:-1]
-        samples = samples.select((samples.end_s - latest_s[:-1] > _TOUCHING * samples.duration_s) & ~stuck)
+        later = samples.end_s - latest_s[:-1] > _TOUCHING * samples.duration_s
+        samples = samples.select(later & ~stuck & (samples.duration_s > 0.0))
         between_s = np.diff(samples.end_s, prepend=self._kept_s)
         touching = between_s < (1 + _TOUCHING) * samples.duration_s
         samples.duration_s[touching] = between_s[touching]

@@ -2,7 +2,7 @@
 
 The last 50 s of measurements and samples are compared (`geometry.inertial_calibration.check_imu_setup`), every 4 s until the
 set-up is confirmed, then every 20 s. What a check finds stands until a later one rules it out. A check takes a quarter of a
-second of computing: it may run beside, and its result counts a fixed time after its start, so that a replay gives the same.
+second of computing, one of fewer than three prisms 1.2 s: it may run beside, and its result counts a fixed time after its start, so that a replay gives the same.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 SILENT_NS = 1_000_000_000  # Without a record for this long the measurements' time bounds the records, too
 INTERVAL_NS = 20_000_000_000
 UNWATCHED_NS = 1_000_000_000  # Without samples for longer, a knock may have been missed: somebody may have plugged the IMU in again
-RESULT_NS = 2_000_000_000  # From the start of a check to its result; a slow computer takes a second
+RESULT_NS, RESULT_FEW_NS = 2_000_000_000, 6_000_000_000
+"""From the start of a check to its result, which the master waits for from then on. A slow computer takes a second; with fewer than three
+prisms, where the trajectory is fitted with the samples, five.
+"""
 
 MAX_FIT_ITERATIONS, MAX_JOINT_ITERATIONS = 40, 30
 """Of a check that says something. Drives need up to 29 and 21. With prisms of another robot among the measurements a check took more,
@@ -258,7 +261,8 @@ class ImuSetupMonitor:
             return
         parameters, measurements, records = self._parameters, tuple(self._measurements), tuple(self._records)
         self._result = self._start(lambda: check_recorded_setup(parameters, measurements, records))
-        self._result_ns = now_ns + RESULT_NS
+        few_prisms = len(parameters.prisms) < MIN_PRISMS
+        self._result_ns = now_ns + (RESULT_FEW_NS if few_prisms else RESULT_NS)
 
     def _judge(self, check: SetupCheck, now_ns: int) -> None:
         self._open = tuple(part for cause, part in _PARTS.items() if cause not in check.excluded)

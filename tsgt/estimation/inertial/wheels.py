@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from tsgt.model import OdometryParameters, OdometrySamples
 
 
+_MAX_SPEED_MPS = 50.0  # As of the lines of a program; a damaged recording may hold more
+
+
 def wheel_samples(
     records: Iterable[OdometrySamples], parameters: OdometryParameters, origin_ns: int
 ) -> WheelSamples:
@@ -36,7 +39,7 @@ class WheelConverter:
             for stamp_ns, duration_ns, speed_mps, valid in zip(
                 record.stamp_ns, record.duration_ns, record.speed_mps, record.valid, strict=True
             )
-            if valid
+            if valid and duration_ns > 0 and abs(speed_mps) <= _MAX_SPEED_MPS
         ]
         # Differences of integers: a Unix time in ns exceeds the precision of a float.
         end_s = (np.array([each[0] for each in rows], dtype=np.int64) - self._zero_ns) / 1e9

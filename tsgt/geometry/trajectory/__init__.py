@@ -7,6 +7,7 @@ States, factors and the Gauss-Newton solver that all estimators share; :class:`F
 from tsgt.geometry.trajectory.fixed_lag import FixedLagSmoother, Predictions
 from tsgt.geometry.trajectory.gauss_newton import (
     MIN_KNOT_SPACING_S,
+    OUTLIER_THRESHOLD,
     Solution,
     knot_times,
     nearest_knots,
@@ -35,6 +36,7 @@ __all__ = [
     "AMBIGUITY_MARGIN_S",
     "MIN_KNOT_SPACING_S",
     "NOT_BY_CHANCE_NIS",
+    "OUTLIER_THRESHOLD",
     "OWN_PRISM_M",
     "POSE_DIM",
     "STATE_DIM",

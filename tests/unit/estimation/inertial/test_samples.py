@@ -72,3 +72,13 @@ def test_samples_of_a_stuck_device_are_dropped() -> None:
     converter = SampleConverter(IMU_PARAMETERS, START)
     counts = [len(converter.convert([record])) for record in (imu_samples(0), stuck, imu_samples(20))]
     assert counts == [10, 2, 10]
+
+
+def test_samples_without_a_duration_are_dropped() -> None:
+    """No device gives them, a damaged recording may: they are missing."""
+    record = imu_samples(0)
+    samples = inertial_samples(
+        [replace(record, duration_ns=(0, *record.duration_ns[1:]))], IMU_PARAMETERS, START
+    )
+    assert len(samples) == 9
+    assert (samples.duration_s > 0.0).all()

@@ -84,6 +84,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     monkeypatch.setattr("tsgt.estimation.continuous.InertialFixedLagSmoother", FakeInertialSmoother)
     monkeypatch.setattr(imu_setup_monitor, "FIRST_NS", 0)
     monkeypatch.setattr(imu_setup_monitor, "RESULT_NS", 0)
+    monkeypatch.setattr(imu_setup_monitor, "RESULT_FEW_NS", 0)
     monkeypatch.setattr(imu_setup_monitor, "UNCONFIRMED_INTERVAL_NS", SECOND // 2)
     scene = stationary_scene().moving(driving).with_limits(estimator="continuous", period_ns=100_000_000)
     return replace(scene, parameters=replace(scene.parameters, imu=IMU_PARAMETERS))

@@ -132,10 +132,10 @@ def test_setup_that_becomes_wrong_without_a_shock_may_be_a_tripod(*, is_shock: b
 def test_few_prisms_do_not_confirm_after_a_blow(prisms: int, *, confirmed: bool) -> None:
     """A drive does not show them all rotations by which the shock may have turned the IMU."""
     monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
-    monitored.run(18)
+    monitored.run(22)
     assert monitored.monitor.confirmed
     monitored.monitor.samples(shock(monitored.samples))
-    monitored.run(18)
+    monitored.run(22)
     assert monitored.monitor.confirmed == confirmed
 
 
@@ -144,7 +144,7 @@ def test_few_prisms_do_not_confirm_after_a_blow_before_them(prisms: int, *, conf
     """No measurement has come yet, so that no trajectory knows of the shock."""
     monitored = Monitored([RIGHT], prisms=prisms)
     monitored.monitor.samples(replace(shock(monitored.samples), received_ns=START - 10 * SECOND))
-    monitored.run(18)
+    monitored.run(22)
     assert monitored.monitor.confirmed == confirmed
 
 
@@ -152,10 +152,10 @@ def test_few_prisms_do_not_confirm_after_a_blow_before_them(prisms: int, *, conf
 def test_few_prisms_confirm_anew_after_a_disagreement(prisms: int) -> None:
     """Whatever made the samples disagree, it was no shock."""
     monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
-    monitored.run(18)
+    monitored.run(22)
     monitored.monitor.restart()
     assert not monitored.monitor.confirmed
-    monitored.run(18)
+    monitored.run(22)
     assert monitored.monitor.confirmed
 
 
@@ -163,11 +163,11 @@ def test_few_prisms_confirm_anew_after_a_disagreement(prisms: int) -> None:
 def test_few_prisms_confirm_anew_after_a_time_without_samples(prisms: int, *, confirmed: bool) -> None:
     """A knock in it shows no shock."""
     monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
-    monitored.run(18)
+    monitored.run(22)
     monitored.seconds += 2
     monitored.run(1)
     assert monitored.monitor.confirmed == confirmed
-    monitored.run(18)
+    monitored.run(22)
     assert monitored.monitor.confirmed
 
 

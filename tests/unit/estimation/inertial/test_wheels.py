@@ -48,3 +48,9 @@ def test_records_one_by_one_give_the_samples_of_all() -> None:
     )
     whole = wheel_samples(records, PARAMETERS, ORIGIN_NS)
     np.testing.assert_array_equal(np.concatenate([each.end_s for each in parts]), whole.end_s)
+
+
+def test_samples_that_no_program_gives_are_dropped() -> None:
+    """Of a damaged recording: without a duration, or faster than any ground robot."""
+    records = [record(0), record(2, duration_ns=(0, 50_000_000)), record(4, speed_mps=(0.1, 1e100))]
+    np.testing.assert_allclose(wheel_samples(records, PARAMETERS, ORIGIN_NS).end_s, [-0.01, 0.04, 0.14, 0.19])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.figures import curve, panels_height_mm, stroke
-from tsgt.analysis.inertial_smoothing import MOVED_REMEDY, SHOCK_REMEDY
+from tsgt.analysis.inertial_smoothing import DISPLACEMENT_REMEDY, MOVED_REMEDY
 from tsgt.analysis.report.page import ReportFigure, Section, Table, format_number
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial import preintegrate
@@ -61,12 +61,12 @@ def imu_section(f: Findings, axis: TimeAxis) -> Section | None:
     if imu.unused:
         text.append(
             f"For {format_number(imu.unused_s)} s the IMU was not used, because samples were missing or contradicted the "
-            "measurements. Poses there rest on the stations alone; without three of them they are invalid."
+            "measurements, or because a few measurements of one prism alone, which may be the wrong one, were all there was. Poses there rest on the stations alone; without three of them they are invalid."
         )
     if np.isfinite(imu.displaced_from_s):
         text.append(
-            f"From {format_number(imu.displaced_from_s)} s on a shock may have displaced the IMU on the robot, which fewer than three "
-            f"stations do not show: {SHOCK_REMEDY}."
+            f"From {format_number(imu.displaced_from_s)} s on a knock may have displaced the IMU on the robot, because of a shock or of "
+            f"missing samples, which fewer than three stations do not show: {DISPLACEMENT_REMEDY}."
         )
     if np.isfinite(imu.moved_from_s):
         text.append(

@@ -46,13 +46,13 @@ MAX_MEAN_SQUARE = 2.5
 """Mean square of the normalised residuals, 1 if samples and measurements agree."""
 MIN_COMPONENTS = 24  # Of residuals in a window: eight measurements
 MAX_CONTRADICTED, MAX_CONTRADICTED_FEW = 0.5, 0.3
-"""Share of the windows beyond which the IMU is not used at all: of three stations, and of fewer. Without others to contradict them, the
-measurements in such a window bend what is around it: in drives of 80 s of which a half was contradicted the other half was off by 29 mm
-and 3 deg, and what was contradicted in less than half a window beside them by 16 mm.
+"""Share of the windows beyond which the IMU is not used at all, with three stations and with fewer. The measurements in a contradicted window
+stay in the fit, and with one or two stations they displace the poses around it: where half of a drive of 80 s was contradicted, those of
+the other half were 29 mm and 3 deg off.
 """
 
-OUTAGE_S = 3.0
-"""Without any measurement, after which those of a wrong prism agree with the trajectory."""
+OUTAGE_S = 10.0
+"""Without any measurement, after which those of a wrong prism agree with the trajectory: after 8 to 10 s those 1 m off did not."""
 
 MAX_BIAS_SIGMAS = 8.0
 """Bias in sigmas of the data sheet. A mounting that is off by an angle passes for a bias of this angle times gravity."""
@@ -107,7 +107,11 @@ class ImuUse:
     @property
     def unused_s(self) -> float:
         """Total time in which it was not used."""
-        return sum(each.end_s - each.start_s for each in self.unused)
+        total_s, until_s = 0.0, -np.inf
+        for each in sorted(self.unused, key=lambda each: each.start_s):
+            total_s += max(each.end_s - max(each.start_s, until_s), 0.0)
+            until_s = max(until_s, each.end_s)
+        return total_s
 
 
 def fit_with_imu(
@@ -177,7 +181,11 @@ def fit_with_imu(
         )
     if few_prisms:
         contradicted = [
-            replace(each, start_s=each.start_s - WINDOW_S / 2, end_s=each.end_s + WINDOW_S / 2)
+            replace(
+                each,
+                start_s=max(each.start_s - WINDOW_S / 2, start_s),
+                end_s=min(each.end_s + WINDOW_S / 2, end_s),
+            )
             for each in contradicted
         ]
     _check_biases(found, imu.noise)
@@ -189,7 +197,7 @@ def fit_with_imu(
         noise_scales,
         overall_scale(observations, noise_scales),
         (*missing, *contradicted, *unproven_intervals(found)),
-        first_untold_s(observations, min(first_shock_s(recorded), first_unwatched_s(recorded))),
+        first_untold_s(observations, min(first_shock_s(recorded), first_unwatched_s(recorded, start_s))),
         first_untold_s(observations, first_move_s(found)),
         0 if wheels is None else len(wheels[0]),
     )
@@ -228,8 +236,8 @@ def first_move_s(fit: InertialFit) -> float:
 def unproven_intervals(fit: InertialFit) -> list[UnusedInterval]:
     """Return the intervals whose only measurements, between two outages of all prisms, may be of a wrong prism.
 
-    Two prisms that agree are none. One prism alone is not for :data:`MIN_TOLD` measurements, because the robot turns meanwhile. All
-    poses in the outages around them rest on them.
+    Those of two prisms that agree are right, and so are :data:`MIN_TOLD` of one prism alone, because the robot turns meanwhile. Poses in
+    the outages before and after rest on them, too.
     """
     time_s, prism = fit.observations.time_s, fit.observations.prism
     agrees = fit.squared_distances < OUTLIER_THRESHOLD**2
@@ -238,14 +246,15 @@ def unproven_intervals(fit: InertialFit) -> list[UnusedInterval]:
     for first, stop in pairwise(starts.tolist()) if len(starts) > 2 else ():
         rows = slice(first, stop)
         counts = np.bincount(prism[rows][agrees[rows]])
-        if np.count_nonzero(counts > 1) < 2 and counts.sum() < MIN_TOLD:
+        if np.count_nonzero(counts) < 2 and counts.sum() < MIN_TOLD:
             start_s, end_s = time_s[max(first - 1, 0)], time_s[min(stop, len(time_s) - 1)]
             found.append(UnusedInterval(float(start_s), float(end_s), "unproven"))
     return found
 
 
-def first_unwatched_s(samples: InertialSamples) -> float:
-    """Return when samples were first missing for so long that a knock may not have been measured; infinite: never."""
+def first_unwatched_s(samples: InertialSamples, start_s: float) -> float:
+    """Return when samples were first missing, after the start, for so long that a knock may not have been measured; infinite: never."""
+    samples = samples.select(samples.end_s > start_s)
     missing_s = samples.end_s[1:] - samples.duration_s[1:] - samples.end_s[:-1]
     rows = np.flatnonzero(missing_s > UNWATCHED_NS / 1e9)
     return float(samples.end_s[rows[0]]) if len(rows) else np.inf

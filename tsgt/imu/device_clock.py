@@ -44,10 +44,11 @@ _DELAY_CAP = 4.0  # a delay counts as at most this many mean delays: a stall say
 STEP_NS = 3_000_000
 """A sample this far below the envelope is not a faster one."""
 
-_LATE_NS = 2e9
-_LATE_SPREAD_NS = 1_500_000
-"""All samples are late when the fastest ones of both halves of this time lie :data:`STEP_NS` above the envelope, and one from the
-other no farther than this. Delays scatter, and those of a stall become shorter.
+_LATE_NS, _MIN_LATE_BINS = 8e9, 15
+_LATE_SPREAD_NS = 4_000_000
+"""All samples are late when the fastest ones of both halves of this time lie :data:`STEP_NS` above the envelope, beyond the mean delay, and
+one from the other no farther than this, by which a clock that is slewed moves at most. Delays scatter, those of a stall become shorter, and a
+computer is seldom busy for so long.
 """
 
 _CANDIDATES = 3  # this many in a row replace the envelope
@@ -250,10 +251,10 @@ class DeviceClock:
             return False
         recent = [each for each in self._bins if each.x > newest - _LATE_NS]
         halves = [each for each in recent if each.x <= middle], [each for each in recent if each.x > middle]
-        if not all(halves):
+        if min(map(len, halves)) < _MIN_LATE_BINS:
             return False
         first, second = (min(each.y - self._line(each.x) for each in half) for half in halves)
-        return min(first, second) > STEP_NS and abs(first - second) < _LATE_SPREAD_NS
+        return min(first, second) > max(STEP_NS, self._mean_delay) and abs(first - second) < _LATE_SPREAD_NS
 
     def _has_shown_more(self, points: list[tuple[float, float]], centre: float, samples: int) -> bool:
         """Whether fits of some seconds have shown a skew beyond the bound of a clock."""

@@ -11,8 +11,10 @@ from typing import NamedTuple
 
 _REMEMBERED = 512  # samples that are recognised when they are printed again
 
-_MAX_REPEATED = 256
-"""More in succession, or all since the device began, are no line that is printed again: the device has begun again."""
+_MIN_REPEATED, _MAX_REPEATED = 50, 256
+"""As many in succession as there were since the device began, from the first number on, or more than the second one, are no line that is
+printed again: the device has begun again.
+"""
 
 _BASELINE = 1000  # samples after which the period is known to 1e-5 and better
 
@@ -70,9 +72,11 @@ class SampleTimes:
         sample = (counter, instrument_time_ns)
         last = self._last
         if last is not None and _not_after(sample, last) and sample in self._recent:
-            self._repeated += 1
+            self._repeated += (
+                sample != last
+            )  # A device that is asked more often than it measures repeats the newest one
             return None
-        began_again = self._repeated >= min(self._count, _MAX_REPEATED) > 0
+        began_again = self._repeated >= min(max(self._count - 1, _MIN_REPEATED), _MAX_REPEATED)
         self._repeated = 0
         self._last = sample
         self._recent.append(sample)

@@ -129,7 +129,7 @@ class DeviceSampler(ABC, Generic[LineT, RecordT]):
                 continue
             if self._clock.steps > steps:
                 self.clock_steps += 1
-                self._gap |= not self._clock.initialised
+                self._gap = True
             self._pending.append(sample)
             if len(self._pending) > self._max_pending:
                 self._pending.popleft()

@@ -165,6 +165,16 @@ def test_poses_of_one_station_allow_for_a_shock_before_them(stations: int, *, di
     assert (sigmas[after].min() > np.radians(0.5)) == displaced
 
 
+def test_measurements_that_are_seconds_apart_are_not_doubted() -> None:
+    """As those of a radio whose share of the air is limited."""
+    recording = imu_recording(DRIVE, stations=1)
+    measurements = recording.measurements[::9]
+    assert np.diff([each.stamp_ns for each in measurements]).min() > 3 * 10**9
+    found = smooth(replace(recording, measurements=measurements))
+    assert found.imu is not None
+    assert not found.imu.unused
+
+
 @pytest.mark.parametrize("stations", [3, 1])
 def test_few_measurements_of_one_prism_between_outages_prove_nothing(stations: int) -> None:
     """They may be of a wrong prism: poses from the last measurement before on are invalid, those before are not."""
@@ -172,7 +182,7 @@ def test_few_measurements_of_one_prism_between_outages_prove_nothing(stations: i
 
     def measured(measurement: Measurement) -> bool:
         time_s = (measurement.stamp_ns - START) / 1e9
-        return time_s < 12.0 or (measurement.station == 1 and 22.0 < time_s < 24.0)
+        return time_s < 8.0 or (measurement.station == 1 and 22.0 < time_s < 24.0)
 
     measurements = [
         moved_measurement(each, 0.4) if each.stamp_ns > START + 20 * 10**9 else each
@@ -184,8 +194,8 @@ def test_few_measurements_of_one_prism_between_outages_prove_nothing(stations: i
     (unproven,) = found.imu.unused
     assert unproven.reason == "unproven"
     # Three stations have poses without the IMU up to the outage limit.
-    assert not found.poses.valid[found.poses.stamp_ns > START + 12.6 * 10**9].any()
-    assert found.poses.valid[found.poses.stamp_ns < START + 11.5 * 10**9][MARGIN:].all()
+    assert not found.poses.valid[found.poses.stamp_ns > START + 8.6 * 10**9].any()
+    assert found.poses.valid[found.poses.stamp_ns < START + 7.5 * 10**9][MARGIN:].all()
 
 
 @pytest.mark.slow
@@ -196,14 +206,14 @@ def test_poses_of_few_stations_allow_for_a_knock_in_a_gap_of_the_samples(
     """It shows no shock."""
     recording = imu_recording(DRIVE, stations=stations)
     silent = [
-        each for each in recording.imu_samples if not 14 * 10**9 < each.stamp_ns[0] - START < 15.2 * 10**9
+        each for each in recording.imu_samples if not 12 * 10**9 < each.stamp_ns[0] - START < 17.3 * 10**9
     ]
     found = smooth(replace(recording, imu_samples=silent)).poses
     unconfirmed = (found.degraded & Degradation.IMU_UNCONFIRMED) != 0
-    after = found.valid & (found.stamp_ns > START + 16 * 10**9)
+    after = found.valid & (found.stamp_ns > START + 18 * 10**9)
     assert after.sum() > 100
     assert (unconfirmed[after] == displaced).all()
-    assert not unconfirmed[found.stamp_ns < START + 13 * 10**9].any()
+    assert not unconfirmed[found.stamp_ns < START + 11 * 10**9].any()
 
 
 def test_clipped_samples_are_left_out() -> None:

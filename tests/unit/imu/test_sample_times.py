@@ -86,6 +86,16 @@ def test_line_printed_again_is_no_restart() -> None:
     assert found[-1] == SampleTime(100 * MS, 5 * MS, 0, False)
 
 
+@pytest.mark.parametrize("length", [1, 10])
+def test_device_that_prints_everything_twice_has_not_restarted(length: int) -> None:
+    """From its first sample or line on; a device that is asked twice as often as it measures does."""
+    lines = [range(first, first + length) for first in range(0, 100, length)]
+    samples = [(None, counter * 5 * MS) for line in lines for counter in [*line, *line]]
+    found = [each for each in pushed(*samples) if each is not None]
+    assert len(found) == 99
+    assert not any(each.restarted for each in found)
+
+
 @pytest.mark.parametrize("count", [60, 400])
 def test_device_that_begins_again_soon_has_restarted(count: int) -> None:
     """Its samples have the numbers and times of those before, in the same order; the next one is not the successor of those."""

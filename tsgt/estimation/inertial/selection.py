@@ -251,8 +251,7 @@ class ImuSelector:
             if found == ImuUse.DISAGREES and uncertain and self._setup is not None:
                 self._setup.restart()
             if self.use == ImuUse.USED:
-                wrong = uncertain or found == ImuUse.WRONG_SETUP
-                self.disagrees |= wrong and self._with.setup_doubt != SHOCK
+                self.disagrees |= self._may_have_moved(found, uncertain=uncertain)
                 again = now_s - self._used_from_s < PROVEN_S
                 # With fewer than three prisms there are no poses meanwhile.
                 longer = 2 if uncertain or self._prisms >= MIN_PRISMS else 1
@@ -320,6 +319,13 @@ class ImuSelector:
     @property
     def _untrusted(self) -> str | None:
         return None if self._setup is None else self._setup.untrusted
+
+    def _may_have_moved(self, found: ImuUse, *, uncertain: bool) -> bool:
+        """Whether an IMU that is rejected, a tripod or a prism may have moved: it was right before, and there was no shock."""
+        if found == ImuUse.WRONG_SETUP:
+            return self._setup is not None and self._setup.may_have_moved
+        was_right = self._setup is None or self._setup.was_confirmed
+        return uncertain and was_right and self._with.setup_doubt != SHOCK
 
     def _found(self, now_s: float) -> ImuUse:
         if self._untrusted is not None:

@@ -1,6 +1,6 @@
 """Checks the configuration of the robot's IMU while the robot drives, from the start. Sans-I/O.
 
-The last 50 s of measurements and samples are compared (`geometry.inertial_calibration.check_imu_setup`), every 4 s until the
+The last 50 s of measurements and samples are compared (`geometry.inertial_calibration.check_imu_setup`), every 4 s (6 s with fewer than three prisms) until the
 set-up is confirmed, then every 20 s. What a check finds stands until a later one rules it out. A check takes a quarter of a
 second of computing, one of fewer than three prisms 1.2 s: it may run beside, and its result counts a fixed time after its start, so that a replay gives the same.
 """
@@ -49,7 +49,7 @@ FIRST_NS = 12_000_000_000  # Of measurements before the first check: fewer do no
 UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 SILENT_NS = 1_000_000_000  # Without a record for this long the measurements' time bounds the records, too
 INTERVAL_NS = 20_000_000_000
-UNWATCHED_NS = 1_000_000_000  # Without samples for longer, a knock may have been missed: somebody may have plugged the IMU in again
+UNWATCHED_NS = 5_000_000_000  # Without samples for longer, a knock may have been missed: somebody may have plugged the IMU in again
 RESULT_NS, RESULT_FEW_NS = 2_000_000_000, 6_000_000_000
 """From the start of a check to its result, which the master waits for from then on. A slow computer takes a second; with fewer than three
 prisms, where the trajectory is fitted with the samples, five.
@@ -192,6 +192,16 @@ class ImuSetupMonitor:
     def untrusted(self) -> str | None:
         """Why the IMU must not be used: what is wrong in its set-up; None if nothing is known to be."""
         return "; ".join(each.text for each in self._standing.values()) or None
+
+    @property
+    def was_confirmed(self) -> bool:
+        """Whether the drive has confirmed the set-up, after the newest shock."""
+        return self._was_confirmed
+
+    @property
+    def may_have_moved(self) -> bool:
+        """Whether a set-up that was confirmed is wrong now in what a move of the IMU, a tripod or a prism changes."""
+        return self._was_confirmed and not _MOVED.isdisjoint(self._standing)
 
     @property
     def unconfirmed(self) -> str:

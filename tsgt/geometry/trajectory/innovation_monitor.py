@@ -43,8 +43,8 @@ class InnovationMonitor:
     prism of a layout is followed even if all of its inconsistent measurements stay outliers, unless they are of a wrong prism:
     within two seconds biases and tilt let a trajectory move by some centimetres unnoticed. ``lost_after_s``: the same time of the
     ambiguity in which the trajectory was lost, followed or not, until one is resolved again.
-    All states in an outage rest on the measurement after it (:meth:`set_outage`), so that they are ambiguous with that. It may make the state
-    ambiguous though all is consistent (:meth:`set_unproven`).
+    All states in an outage rest on the measurement after it (:meth:`set_outage`): if that one is ambiguous, they are. It may be though
+    all is consistent (:meth:`set_unproven`).
     """
 
     def __init__(self, alone: int | None = None) -> None:
@@ -119,8 +119,8 @@ class InnovationMonitor:
     def set_unproven(self, time_s: float, prisms: frozenset[int], *, needs_two_prisms: bool) -> None:
         """Mark the state as ambiguous from a measurement on that a wrong prism could have given as well.
 
-        ``needs_two_prisms``: until two prisms agree, however often one does with itself. They say nothing then of an ambiguity before an
-        outage, after which all agrees.
+        ``needs_two_prisms``: until two prisms agree, however often one does with itself. What they say then is not true of an ambiguity
+        from before an outage: after it the trajectory is so uncertain that all agrees.
         """
         if not self.inconsistent_prisms:
             self._inconsistent_from_s, self.followed_for_s = self._since(time_s), 0.0

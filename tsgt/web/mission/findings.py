@@ -177,11 +177,11 @@ def degradations(
         degraded_by.discard("uncertain")
         degraded_by |= set(smoothed.degraded_by) & {"uncertain"}
     texts = {
+        "imu_disagrees": "the IMU disagrees with the prisms: IMU, tripod or prism moved? Check the tripods first",
         "prism_missing": _missing(pose, conditions) or "a prism is not measured",
         "old_measurements": "the pose rests on old measurements",
         "ambiguous": "measurements contradict each other",
         "imu_unconfirmed": UNCONFIRMED,
-        "imu_disagrees": "the IMU disagrees with the prisms: IMU, tripod or prism moved? Check the tripods first",
         "residual": "the prisms nearly miss their layout: tripod or prism moved?",
         "uncertain": _uncertain(smoothed or pose, limits),
     }

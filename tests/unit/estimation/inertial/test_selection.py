@@ -312,7 +312,9 @@ def sound(monkeypatch: pytest.MonkeyPatch) -> tuple[ImuSelector, SimpleNamespace
     monkeypatch.setattr(ImuSelector, "_compare", lambda *_: None)
     without = SimpleNamespace(converged=True, ambiguous=False, update=lambda _: None)
     window = sound_window()
-    setup = SimpleNamespace(untrusted=None, confirmed=True, unconfirmed="")
+    setup = SimpleNamespace(
+        untrusted=None, confirmed=True, unconfirmed="", was_confirmed=True, may_have_moved=False
+    )
     setup.restart = lambda: vars(setup).update(confirmed=False)
 
     def create_with(min_prisms: int) -> Any:
@@ -665,6 +667,26 @@ def test_imu_that_disagreed_without_a_shock_degrades_the_poses_without_it(
     assert by_use["disagrees"] == {disagrees}
     assert time_of(poses[-1]) > 23.0
     assert poses[-1].imu == "used"
+
+
+@pytest.mark.parametrize(
+    ("was_confirmed", "may_have_moved", "disagrees"),
+    [(True, True, True), (True, False, False), (False, False, False)],
+)
+def test_setup_that_was_never_right_is_no_move(
+    sound: tuple[ImuSelector, SimpleNamespace, SimpleNamespace],
+    *,
+    was_confirmed: bool,
+    may_have_moved: bool,
+    disagrees: bool,
+) -> None:
+    """Nor is a wrong latency, or an IMU that was used unconfirmed."""
+    selector, _, setup = sound
+    uses_of(selector, 0.0, 1.0)
+    setup.untrusted, setup.confirmed = "the set-up is wrong", False
+    setup.was_confirmed, setup.may_have_moved = was_confirmed, may_have_moved
+    assert uses_of(selector, 1.0, 2.0)[0][0] == ImuUse.WRONG_SETUP
+    assert selector.disagrees == disagrees
 
 
 def test_poses_of_a_contradicted_station_are_invalid(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from harness.inertial.inertial_drive import DEG, imu_parameters, inertial_drive,
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from tsgt.errors import GeometryError
 from tsgt.geometry import log_so3
 from tsgt.geometry.inertial import InertialFixedLagSmoother, fit_inertial_trajectory
 from tsgt.model import ImuParameters, MotionPrior
@@ -285,6 +286,28 @@ def test_measurement_after_an_outage_is_unproven_beside_a_backlog() -> None:
     assert live.window.converged
     assert live.window.ambiguous
     assert live.window.ambiguous_from_s < together.time_s[0]
+
+
+@pytest.mark.slow
+def test_trajectory_lost_in_a_backlog_is_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measurements from before an outage end it, those after it arrived with them, and the first search fails."""
+    observations = measurements()
+    live = Live()
+    live.measure(observations.select(observations.time_s < 5.0))
+    before = np.flatnonzero((observations.time_s > 5.0) & (observations.time_s < 5.5))[:2]
+    after = np.flatnonzero(observations.time_s > 6.6)
+    together = observations.select(np.append(before, after[0]))
+    live.sample_until(together.time_s[-1] + DELAY_S)
+
+    def fail(*_: object) -> None:
+        raise GeometryError("not determined")
+
+    with monkeypatch.context() as failing:
+        failing.setattr(live.window, "_update_tracked", lambda *_: False)
+        failing.setattr(live.window._search, "find", fail)
+        live.window.update(together)
+    live.measure(observations.select(after[1:]))
+    assert live.window.converged
 
 
 @pytest.mark.slow

@@ -73,8 +73,8 @@ CONSISTENT_ALONE = 5
 """Measurements in succession that resolve an ambiguity, also of one prism: the samples, not the measurements before, predict
 each of them. A chance agreement of wrong ones within the gate, five times, is none.
 """
-UNPROVEN_GAP_S, UNPROVEN_SIGMA_M = 1.0, 0.02
-"""Time without measurements, and sigma of the position after it, from which on a wrong prism, two decimetres away, or a reflection may agree."""
+UNPROVEN_GAP_S, UNPROVEN_SIGMA_M = 1.0, 0.05
+"""Time without measurements, and sigma of the position after it, from which on a wrong prism, some decimetres away, may agree."""
 MAX_ROTATION_SQUARES = 20.0
 """Of the rotation of a start against that from before, normalised, three components; 2 in 10,000 exceed it."""
 WHEELS_SPAN_S = 4.0  # Over which rejected odometry counts
@@ -306,7 +306,8 @@ class InertialFixedLagSmoother(MeasurementWindow):
             super().update(new.select(slice(row)))
             new = new.select(slice(row, None))
         if not self._converged:
-            self._searched = merge_observations(self._searched, new)
+            searched = self.observations if self._searched is None else self._searched
+            self._searched = merge_observations(searched, new)
         super().update(new)
         if self._converged:
             self._searched = None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -25,6 +26,11 @@ from tsgt.geometry.inertial.odometry import (
     linearise_odometry,
 )
 from tsgt.model import MotionPrior, OdometryParameters
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from tsgt.geometry import FloatArray
 
 PARAMETERS = OdometryParameters(
     position_m=(-0.3, 0.1, 0.05),
@@ -205,56 +211,82 @@ def test_outage_with_odometry() -> None:
     assert found.knots.wheels[-1, :2].sum() == pytest.approx(1 / 0.98 - 1, abs=0.005)
 
 
-@pytest.mark.slow
-def test_live_outage_with_odometry() -> None:
-    """Twelve seconds without measurements, live: wheels with 2 % of scale halve the error, with an honest uncertainty.
+@dataclass
+class LiveOutage:
+    """Twelve seconds without measurements, live, with wheels of 2 % of scale that turn at ``factors`` of their speed by time."""
 
-    Wheels that spin, 10 % for two seconds, harm neither.
-    """
-    imu = imu_parameters()
-    drive = inertial_drive(31.0, seed=12)
-    samples, observations = drive.samples(imu), drive.measure()
-    position, rotation = drive.pose_at(np.arange(0.0, 31.0, 0.05))
-    moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
-    end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
-    wheels = WheelSamples(end_s, np.full(len(end_s), 0.05), 0.98 * moved / 0.05)
-    errors = []
-    rejected: list[float | None] = []
-    spinning = (end_s > 21.0) & (end_s < 23.0)
-    for parameters, spin in ((None, 1.0), (OdometryParameters(), 1.0), (OdometryParameters(), 1.1)):
-        driven_wheels = replace(wheels, speed_mps=np.where(spinning, spin, 1.0) * wheels.speed_mps)
-        window = InertialFixedLagSmoother(imu, MotionPrior(), reference_m=np.zeros(3), odometry=parameters)
-        normalised, squares = [], []
+    odometry: OdometryParameters | None = None
+    factors: Callable[[FloatArray], FloatArray] = np.ones_like
+
+    def __post_init__(self) -> None:
+        imu = imu_parameters()
+        drive = inertial_drive(31.0, seed=12)
+        samples, observations = drive.samples(imu), drive.measure()
+        position, rotation = drive.pose_at(np.arange(0.0, 31.0, 0.05))
+        moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
+        end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
+        speed = 0.98 * moved / 0.05 * self.factors(end_s)
+        wheels = WheelSamples(end_s, np.full(len(end_s), 0.05), speed)
+        self.window = InertialFixedLagSmoother(
+            imu, MotionPrior(), reference_m=np.zeros(3), odometry=self.odometry
+        )
+        self.squared_sigmas: list[float] = []
+        squares = []
+        self.rejected_share: float | None = None
         for now_s in np.arange(0.5, 30.5, 0.5):
             arrived = (samples.end_s <= now_s) & (samples.end_s > now_s - 0.5)
-            window.add_samples(samples.select(arrived))
+            self.window.add_samples(samples.select(arrived))
             # Half a second late.
             driven = (wheels.end_s <= now_s - 0.5) & (wheels.end_s > now_s - 1.0)
-            window.add_odometry(driven_wheels.select(driven))
+            self.window.add_odometry(wheels.select(driven))
             measured = (observations.time_s <= now_s - 0.3) & (observations.time_s > now_s - 0.8)
             if measured.any() and not 17.0 < now_s < 29.5:
-                window.update(observations.select(measured))
-            window.marginalise_before(now_s - 3.0)
-            if now_s > 18.0:
-                state, covariance = window.predict(now_s)
+                self.window.update(observations.select(measured))
+            self.window.marginalise_before(now_s - 3.0)
+            if now_s > 18.0 and self.window.initialised:
+                state, covariance = self.window.predict(now_s)
                 error = state.position[0] - drive.pose_at(np.array([now_s]))[0][0]
-                normalised.append(error @ np.linalg.solve(covariance[0, :3, :3], error))
+                self.squared_sigmas.append(error @ np.linalg.solve(covariance[0, :3, :3], error))
                 squares.append(error @ error)
-            if now_s == 23.5 and parameters is not None:  # Samples are half a second late
-                rejected.append(found.rejected_share if (found := window.wheels) else None)
-        assert window.converged
-        assert (window.wheels is None) == (parameters is None)
-        assert np.mean(normalised) < 6.0
-        errors.append(np.sqrt(np.mean(squares)))
-        assert np.max(normalised) < 16.0
-    assert max(errors[1:]) < 0.5 * errors[0]
-    assert rejected[0] == 0.0
-    assert rejected[1] is not None
-    assert 0.1 < rejected[1] < 0.8
-    found = window.wheels
+            if now_s == 23.5 and (found := self.window.wheels) is not None:  # Samples are half a second late
+                self.rejected_share = found.rejected_share
+        self.error_m = float(np.sqrt(np.mean(squares)))
+
+
+def between(from_s: float, to_s: float, factor: float) -> Callable[[FloatArray], FloatArray]:
+    """Return factors on the speed that are not one for some time."""
+    return lambda time_s: np.where((time_s > from_s) & (time_s < to_s), factor, 1.0)
+
+
+@pytest.mark.slow
+def test_live_outage_with_odometry() -> None:
+    """Wheels halve the error, with an honest uncertainty. Those that spin, 10 % for two seconds, harm neither."""
+    alone = LiveOutage()
+    right = LiveOutage(OdometryParameters())
+    spinning = LiveOutage(OdometryParameters(), between(21.0, 23.0, 1.1))
+    assert alone.window.wheels is None
+    for each in (alone, right, spinning):
+        assert each.window.converged
+        assert np.mean(each.squared_sigmas) < 6.0
+        assert np.max(each.squared_sigmas) < 16.0
+    assert max(right.error_m, spinning.error_m) < 0.5 * alone.error_m
+    assert right.rejected_share == 0.0
+    assert spinning.rejected_share is not None
+    assert 0.1 < spinning.rejected_share < 0.8
+    found = spinning.window.wheels
     assert found is not None
     # Of the true speed the measured one is 0.98 times.
     assert abs(found.values[:2].sum() - (1 / 0.98 - 1)) < 3 * found.sigmas[:2].sum()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.0, 0.7])
+def test_wheels_that_are_wrong_for_long_do_not_count_again_by_chance(factor: float) -> None:
+    """The longer the IMU goes on alone, the less it can contradict them."""
+    wrong = LiveOutage(OdometryParameters(), between(18.0, 40.0, factor))
+    assert wrong.window.converged
+    assert np.max(wrong.squared_sigmas) < 16.0
+    assert wrong.error_m < 1.5 * LiveOutage().error_m
 
 
 def test_odometry_without_an_imu_is_not_held_for_ever() -> None:

@@ -518,7 +518,11 @@ class InertialFixedLagSmoother(MeasurementWindow):
             propagate(guess, row, factors, self._gravity, self._gyro_only)
         self._held.stale_from_s = np.inf
         if factors.odometry is not None:
-            factors = replace(factors, odometry=factors.odometry.with_slip(guess.wheels[:, 1]))
+            assert self._predictor is not None  # noqa: S101 (converged)
+            steps = factors.odometry.with_slip(guess.wheels[:, 1])
+            rejected = self._predictor.wheels_rejected(times_s)
+            whitening = np.where(rejected[:, None, None], 0.0, steps.whitening)
+            factors = replace(factors, odometry=replace(steps, whitening=whitening))
         return KnotWindow(guess, factors, samples.at(times_s), window.anchor, samples)
 
     def _accept(

@@ -25,6 +25,8 @@ from tsgt.geometry.trajectory.propagation import Propagator
 from tsgt.geometry.trajectory.states import POSE_DIM, STATE_DIM, States
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from tsgt.geometry.inertial.live.rate_prediction import PredictedRotation
     from tsgt.geometry.inertial.odometry import Odometry, OdometrySteps
     from tsgt.geometry.inertial.preintegration import Preintegrated
@@ -33,6 +35,11 @@ if TYPE_CHECKING:
     from tsgt.model import ImuNoise, MotionPrior
 
 LINK_S = 0.25  # Between states that are kept
+LONG_PREDICTION_S = 1.0  # Beyond the newest knot
+MIN_AGREEING, AGREEING_NIS = 4, 7.8
+"""Wheels that were rejected count again after as many steps in succession as were rejected, this many at least, whose NIS is within what
+95 % of right ones have: the longer the IMU goes on alone, the more often wrong wheels agree with it by chance.
+"""
 TREND_SPAN_S = 0.1
 """Samples whose mean goes on beyond the last one: shaking of 8 to 60 Hz averages out, steering does not. On a shaken robot
 50 ms of rotation were predicted to 0.09 deg; to 0.12 deg with half as long, 0.10 deg with twice as long.
@@ -52,6 +59,7 @@ class _Link:
     gravity: Gravity
     covariance: FloatArray  # (D + 2, D + 2)
     by_start: FloatArray  # (D + 2, D + 2) by the error of the newest knot
+    must_agree: int = 0  # Steps in which the wheels must agree before they count
     wheels_rejected: bool | None = (
         None  # Whether the wheels contradict the samples since the state before; None: no odometry
     )
@@ -121,6 +129,19 @@ class StrapdownPredictor:
             float(step_s[known].sum()) + sum(each for each, _ in beyond),
             float(step_s[known & rejected].sum()) + sum(each for each, wrong in beyond if wrong),
         )
+
+    def wheels_rejected(self, knots_s: FloatArray) -> NDArray[np.bool_]:
+        """(K - 1,) whether the wheels were rejected in the steps between K knots, as far as they are those of a long prediction.
+
+        Many wrong steps together would pull the states between them, however little each counts; shorter ones follow what is measured.
+        """
+        found = np.zeros(len(knots_s) - 1, np.bool_)
+        if self._links[-1].time_s - self.time_s < LONG_PREDICTION_S:
+            return found
+        for before, link in pairwise(self._links):
+            if link.wheels_rejected:
+                found |= (knots_s[:-1] < link.time_s) & (knots_s[1:] > before.time_s)
+        return found
 
     def at(
         self, time_s: float, samples: InertialSamples, odometry: Odometry | None = None
@@ -233,8 +254,13 @@ class StrapdownPredictor:
         gain = np.linalg.solve(innovation, mixed.T).T
         residual = rows[:, -1]
         known = bool(covered_steps(steps)[0])
-        if residual @ np.linalg.solve(innovation, residual) > OUTLIER_THRESHOLD**2:  # wheels that spin
-            return _Link(moved, link.gravity, covariance, by_start, wheels_rejected=True)
+        nis, must_agree = float(residual @ np.linalg.solve(innovation, residual)), link.must_agree
+        if known and nis > (AGREEING_NIS if must_agree else OUTLIER_THRESHOLD**2):
+            must_agree = max(must_agree + 1, MIN_AGREEING)
+        elif known and must_agree:
+            must_agree -= 1
+        if known and must_agree:  # Wheels that spin, or did a moment ago
+            return _Link(moved, link.gravity, covariance, by_start, must_agree, wheels_rejected=True)
         error = -gain @ residual
         covariance -= gain @ mixed.T
         moved = moved.retract(error[None, :size])
@@ -244,6 +270,7 @@ class StrapdownPredictor:
             link.gravity.retract(error[size:]),
             0.5 * (covariance + covariance.T),
             by_start - gain @ by_both @ link.by_start,
+            must_agree,
             wheels_rejected=slips if known else None,
         )
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from tsgt.errors import GeometryError
 from tsgt.geometry import log_so3
 from tsgt.geometry.inertial import InertialFixedLagSmoother, fit_inertial_trajectory
+from tsgt.geometry.inertial.live import fixed_lag
 from tsgt.model import ImuParameters, MotionPrior
 
 if TYPE_CHECKING:
@@ -367,6 +368,29 @@ def test_no_wrong_start_after_a_tripod_has_tilted() -> None:
         error = difference(state.rotation, DRIVE.pose_at(np.array([time_s]))[1])[0]
         assert error @ np.linalg.solve(covariance[0, 3:, 3:], error) < 30.0
     assert contradicted
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("up_m", [0.0, 0.06])
+def test_rotation_is_known_after_an_outage_that_loses_the_trajectory(
+    up_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One tripod has risen meanwhile; the samples of the outage have been forgotten."""
+    monkeypatch.setattr(fixed_lag, "MAX_OUTAGE_S", 1.0)
+    monkeypatch.setattr(fixed_lag, "SEARCH_S", 0.5)
+    observations = measurements(2)
+    raised = (observations.station == 0) & (observations.time_s > 4.0)
+    points = observations.points_m + raised[:, None] * np.array([0.0, 0.0, up_m])
+    observations = replace(observations, points_m=points)
+    live = Live()
+    live.measure(observations.select(observations.time_s < 4.0))
+    for now_s in np.arange(4.0, 8.5, 0.05).tolist():
+        live.sample_until(now_s)
+        live.window.marginalise_before(now_s - LAG_S)
+    assert not live.window.initialised
+    for row in np.flatnonzero(observations.time_s > 8.5):
+        live.measure(observations.select(slice(row, row + 1)))
+    assert live.window.converged == (up_m == 0.0)
 
 
 @pytest.mark.slow

@@ -206,6 +206,8 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._searched = self.observations
         if self._predictor is not None and before_s - self._predictor.time_s > MAX_OUTAGE_S:
             self._converged = False
+            if len(self._held.imu):
+                self._keep_rotation(before_s)
             self._discard_trajectory()
         elif self._converged:
             assert self._window is not None  # noqa: S101 (converged)
@@ -213,6 +215,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
         elif self._searched is not None:
             before_s -= SEARCH_S
             self._searched = self._searched.select(self._searched.time_s >= before_s)
+        known = self._known
+        if known is not None and self._predictor is None and before_s > known.time_s and len(self._held.imu):
+            self._keep_rotation(before_s)  # Before the samples are forgotten
         # A trajectory that is lost still predicts.
         self._held.discard_before(
             before_s if self._predictor is None else min(before_s, self._predictor.time_s)

@@ -64,9 +64,9 @@ DISPLACEMENT_REMEDY = (
 MOVED_REMEDY = "a tripod or prism may have moved, and the poses are invalid from then on; check the stations (tsgt calibrate check)"
 
 MIN_TOLD = 8  # Measurements of each of three prisms that tell what happened before them; of a prism alone that it is the right one
-LONG_AFTER_S = (
-    20.0  # After an outage; wrong measurements, of a robot that turns, have contradicted the IMU by then
-)
+LONG_AFTER_S = 20.0
+"""After an outage: measurements of a wrong prism have contradicted the IMU by then, if the robot turns."""
+
 MOVED_SQUARE = 25.0  # Squared distance in sigmas of two successive measurements of one prism
 
 NOISE_SCALE_PRIOR = 30.0

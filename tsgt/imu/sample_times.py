@@ -12,8 +12,8 @@ from typing import NamedTuple
 _REMEMBERED = 512  # samples that are recognised when they are printed again
 
 _MIN_REPEATED, _MAX_REPEATED = 50, 256
-"""As many in succession as there were since the device began, from the first number on, or more than the second one, are no line that is
-printed again: the device has begun again.
+"""Bounds of the number of known samples in succession that shows that the device has begun again: all since it began. Fewer may be a line
+that is printed again.
 """
 
 _BASELINE = 1000  # samples after which the period is known to 1e-5 and better
@@ -72,9 +72,8 @@ class SampleTimes:
         sample = (counter, instrument_time_ns)
         last = self._last
         if last is not None and _not_after(sample, last) and sample in self._recent:
-            self._repeated += (
-                sample != last
-            )  # A device that is asked more often than it measures repeats the newest one
+            # A device that is asked more often than it measures repeats the newest one.
+            self._repeated += sample != last
             return None
         began_again = self._repeated >= min(max(self._count - 1, _MIN_REPEATED), _MAX_REPEATED)
         self._repeated = 0

@@ -30,6 +30,8 @@ from tsgt.model import MotionPrior, OdometryParameters
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from harness.inertial.inertial_drive import InertialDrive
+
     from tsgt.geometry import FloatArray
 
 PARAMETERS = OdometryParameters(
@@ -144,17 +146,23 @@ def test_large_slip_is_noisy() -> None:
     np.testing.assert_array_equal(found.with_slip(np.zeros(5)).slip_noise, 1.0)
 
 
+def driven(drive: InertialDrive) -> WheelSamples:
+    """Return exact samples of a drive of 31 s at 20 Hz."""
+    position, rotation = drive.pose_at(np.arange(0.0, 31.0, 0.05))
+    moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
+    end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
+    return WheelSamples(end_s, np.full(len(end_s), 0.05), moved / 0.05)
+
+
 @pytest.mark.slow
 def test_wheels_that_slide_do_not_change_the_scale() -> None:
     """Post-processed and live, six seconds 30 % too slow; the robot has stood until shortly before."""
     imu = imu_parameters()
     drive = inertial_drive(31.0, seed=12)
     samples, observations = drive.samples(imu), drive.measure()
-    position, rotation = drive.pose_at(np.arange(0.0, 31.0, 0.05))
-    moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
-    end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
-    sliding = np.where((end_s > 22.0) & (end_s < 28.0), 0.7, 0.99)
-    wheels = WheelSamples(end_s, np.full(len(end_s), 0.05), sliding * moved / 0.05)
+    right = driven(drive)
+    sliding = np.where((right.end_s > 22.0) & (right.end_s < 28.0), 0.7, 0.99)
+    wheels = replace(right, speed_mps=sliding * right.speed_mps)
     odometry = wheels, OdometryParameters()
     fit = fit_inertial_trajectory(observations, samples, imu, reference_m=np.zeros(3), odometry=odometry)
     assert fit.wheels is not None
@@ -169,7 +177,7 @@ def test_wheels_that_slide_do_not_change_the_scale() -> None:
     )
     for now_s in np.arange(0.5, 30.5, 0.5):
         window.add_samples(samples.select((samples.end_s <= now_s) & (samples.end_s > now_s - 0.5)))
-        window.add_odometry(wheels.select((end_s <= now_s - 0.1) & (end_s > now_s - 0.6)))
+        window.add_odometry(wheels.select((wheels.end_s <= now_s - 0.1) & (wheels.end_s > now_s - 0.6)))
         measured = (observations.time_s <= now_s - 0.3) & (observations.time_s > now_s - 0.8)
         if measured.any():
             window.update(observations.select(measured))
@@ -222,11 +230,8 @@ class LiveOutage:
         imu = imu_parameters()
         drive = inertial_drive(31.0, seed=12)
         samples, observations = drive.samples(imu), drive.measure()
-        position, rotation = drive.pose_at(np.arange(0.0, 31.0, 0.05))
-        moved = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))[:, 0]
-        end_s = np.arange(0.05, 0.05 * len(position) - 0.01, 0.05)
-        speed = 0.98 * moved / 0.05 * self.factors(end_s)
-        wheels = WheelSamples(end_s, np.full(len(end_s), 0.05), speed)
+        right = driven(drive)
+        wheels = replace(right, speed_mps=0.98 * self.factors(right.end_s) * right.speed_mps)
         self.window = InertialFixedLagSmoother(
             imu, MotionPrior(), reference_m=np.zeros(3), odometry=self.odometry
         )
@@ -237,8 +242,8 @@ class LiveOutage:
             arrived = (samples.end_s <= now_s) & (samples.end_s > now_s - 0.5)
             self.window.add_samples(samples.select(arrived))
             # Half a second late.
-            driven = (wheels.end_s <= now_s - 0.5) & (wheels.end_s > now_s - 1.0)
-            self.window.add_odometry(wheels.select(driven))
+            turned = (wheels.end_s <= now_s - 0.5) & (wheels.end_s > now_s - 1.0)
+            self.window.add_odometry(wheels.select(turned))
             measured = (observations.time_s <= now_s - 0.3) & (observations.time_s > now_s - 0.8)
             if measured.any() and not 17.0 < now_s < 29.5:
                 self.window.update(observations.select(measured))

@@ -60,8 +60,9 @@ def imu_section(f: Findings, axis: TimeAxis) -> Section | None:
     text = [f"The poses rest on the IMU and on the measurements of {stations}."]
     if imu.unused:
         text.append(
-            f"For {format_number(imu.unused_s)} s the IMU was not used, because samples were missing or contradicted the "
-            "measurements, or because a few measurements of one prism alone, which may be the wrong one, were all there was. Poses there rest on the stations alone; without three of them they are invalid."
+            f"For {format_number(imu.unused_s)} s the IMU was not used: samples were missing or contradicted the measurements, or "
+            "there were only a few measurements of one prism, which may be the wrong one. Poses there rest on the stations alone; "
+            "without three of them they are invalid."
         )
     if np.isfinite(imu.displaced_from_s):
         text.append(

@@ -149,10 +149,13 @@ class InnovationMonitor:
         new_nis: FloatArray,
         outliers: NDArray[np.bool_],
         residuals_m: FloatArray,
+        *,
+        certain: NDArray[np.bool_] | None = None,
     ) -> None:
         """Process the N new of the window's M measurements (``is_new``); ``outliers``, (M,), are of the updated trajectory.
 
-        ``new_nis``: (N,) of the new ones. ``residuals_m``: (M, 3) of the updated trajectory.
+        ``new_nis``: (N,) of the new ones. ``residuals_m``: (M, 3) of the updated trajectory. ``certain``: (N,) whether the rotation was
+        certain enough that a linear prediction tells what chance gives; None: it was.
         """
         flagged = np.zeros(len(observations), np.bool_)
         flagged[~is_new] = self._flagged
@@ -166,7 +169,7 @@ class InnovationMonitor:
             observations.time_s[is_new].tolist(),
             observations.prism[is_new].tolist(),
             flagged[is_new].tolist(),
-            new_nis.tolist(),
+            (new_nis if certain is None else np.where(certain, new_nis, 0.0)).tolist(),
         )
         for time_s, prism, is_flagged, nis in zip(*rows, strict=True):
             if not self.inconsistent_prisms:

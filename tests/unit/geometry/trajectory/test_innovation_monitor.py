@@ -40,11 +40,12 @@ def _monitor_after(
     first_nis: float = NOT_BY_CHANCE,
     layout: int = 3,
     residual_m: float = 0.0,
+    certain: bool = True,
 ) -> InnovationMonitor:
     """Follow measurements after a start: ``a``, ``b`` and ``c`` are consistent ones of three prisms, capitals inconsistent ones.
 
     ``first_nis``: of the first inconsistent one; the others are inconsistent by what chance gives. ``layout``: its prisms.
-    ``residual_m``: of inconsistent ones. ``first_followed``: whether the first one is, where the others are.
+    ``residual_m``: of inconsistent ones. ``first_followed``: whether the first one is, where the others are. ``certain``: the rotation.
     """
     monitor = InnovationMonitor(alone)
     start = [0, 1] if layout > 1 else [0, 0]
@@ -61,7 +62,9 @@ def _monitor_after(
         rows = slice(max(0, row + 1 - window), row + 1)
         held = _observations(*prisms[: row + 1], layout=layout).select(rows)
         is_new = np.arange(len(held)) == len(held) - 1
-        monitor.update(held, is_new, nis[row : row + 1], outlier[rows], residuals_m[rows])
+        monitor.update(
+            held, is_new, nis[row : row + 1], outlier[rows], residuals_m[rows], certain=np.array([certain])
+        )
         monitor.select(np.arange(len(held)) > len(held) - window)
     return monitor
 
@@ -116,6 +119,13 @@ def test_measurements_inconsistent_by_chance_are_not_followed(
     """Those of one prism share the error of one prediction: one of them must be beyond what chance gives."""
     monitor = _monitor_after("AAAaaaaa", alone=5, followed=True, first_nis=first_nis, window=window)
     assert monitor.followed_for_s == pytest.approx(for_s)
+
+
+def test_innovations_after_an_uncertain_rotation_tell_of_no_station() -> None:
+    """A linear prediction far from the true rotation says nothing of what chance gives."""
+    monitor = _monitor_after("AAAaaaaa", alone=5, followed=True, certain=False)
+    assert monitor.followed_for_s == 0.0
+    assert _monitor_after("A", certain=False).inconsistent_prisms
 
 
 @pytest.mark.parametrize("window", [99, 4])

@@ -44,10 +44,11 @@ from tsgt.geometry.trajectory.gauss_newton import (
     add_measurements,
     nearest_knots,
 )
-from tsgt.geometry.trajectory.innovation_monitor import InnovationMonitor
+from tsgt.geometry.trajectory.innovation_monitor import NOT_BY_CHANCE_NIS, InnovationMonitor
 from tsgt.geometry.trajectory.measurement_factors import merge_observations, time_order
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
+    LOST_SIGMA_RAD,
     MAX_STEPS,
     MeasurementWindow,
     is_below_step_tolerance,
@@ -446,6 +447,10 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._search.restart()
             self._searched = self._known = None
             return False
+        certain = None
+        if sequential_nis.max() > NOT_BY_CHANCE_NIS:
+            rotation_covariance = factor.marginals()[0][knot_index[is_new], 3:6, 3:6]
+            certain = np.linalg.eigvalsh(rotation_covariance)[:, -1] < LOST_SIGMA_RAD**2
         weights = self._weigh(nis, sequential_nis)
         system.weights[is_new] = weights
         add_measurements(
@@ -479,7 +484,9 @@ class InertialFixedLagSmoother(MeasurementWindow):
             self._window = replace(window, knots=found.knots, factors=found.factors)
             outliers = self._accept(observations, knot_index, found.gravity, found.factor, found)
             self._converged &= found.iterations < MAX_ITERATIONS
-        self._monitor.update(observations, is_new, sequential_nis, outliers, self.residuals_m)
+        self._monitor.update(
+            observations, is_new, sequential_nis, outliers, self.residuals_m, certain=certain
+        )
         return self._converged
 
     def _check_proven(self, new: Observations) -> None:

@@ -584,3 +584,19 @@ def test_matrix_that_cannot_be_factorised_loses_the_trajectory(
     live.measure(observations.select((observations.time_s < 6.0) & (np.arange(len(observations)) > first)))
     converged.append(live.window.converged)
     assert converged == [True, False, True]
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_innovations_are_no_evidence_where_missing_samples_lose_the_rotation(*, missing: bool) -> None:
+    """Measurements of an outage's end that come together are far from a linear prediction, though no station has moved."""
+    observations = measurements()
+    samples = SAMPLES.select((SAMPLES.end_s < 5.2) | (SAMPLES.end_s > 6.5)) if missing else SAMPLES
+    live = Live()
+    live.measure(observations.select(observations.time_s < 5.0), samples)
+    together = observations.select((observations.time_s > 7.2) & (observations.time_s < 8.2))
+    together.points_m[-2] += 2.0
+    live.sample_until(8.5, samples)
+    live.window.update(together)
+    assert live.window.converged
+    assert live.window.ambiguous
+    assert live.window.beyond_chance is not missing

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from tsgt.estimation import check_recorded_setup
+from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tsgt.geometry.inertial_calibration import SetupCheck
     from tsgt.model import ImuSamples, Measurement, Parameters
 
 PART_NS = 50_000_000_000
@@ -17,29 +20,42 @@ MAX_PARTS = 3  # Each takes a quarter of a second of computing
 MARGIN_NS = 1_000_000_000  # Samples beyond a part, whose stamps may be late
 
 
-def wrong_imu_setup(
+@dataclass(frozen=True, slots=True)
+class RecordedSetup:
+    """What parts of a recording say about the set-up of the IMU."""
+
+    wrong: str = ""  # Empty if nothing is known to be wrong
+    confirmed: bool = False  # In one of the parts, at least
+
+
+def recorded_imu_setup(
     parameters: Parameters, measurements: Sequence[Measurement], records: Sequence[ImuSamples]
-) -> str:
-    """Return what is wrong in the set-up of the IMU, by parts of the recording; empty if nothing is known to be."""
+) -> RecordedSetup:
+    """Compare the set-up of the IMU with parts of a recording; if it is wrong and there are three prisms, also with its beginning and end."""
     ordered = sorted(measurements, key=lambda each: each.stamp_ns)
     samples = sorted(records, key=lambda each: each.stamp_ns[-1])
     if not ordered or not samples:
-        return ""
+        return RecordedSetup()
     stamps_ns = [each.stamp_ns for each in ordered]
     samples_ns = [each.stamp_ns[-1] for each in samples]
     first_ns, last_ns = stamps_ns[0], max(stamps_ns[-1] - PART_NS, stamps_ns[0])
     count = min(MAX_PARTS, 1 + (last_ns - first_ns) // PART_NS)
-    causes: dict[str, str] = {}
-    for part in range(count):
-        begin_ns = first_ns + (last_ns - first_ns) * (part + 1) // (count + 1)
+
+    def checked(part: int) -> SetupCheck:
+        begin_ns = first_ns + (last_ns - first_ns) * part // (count + 1)
         end_ns = begin_ns + PART_NS
-        found = check_recorded_setup(
+        return check_recorded_setup(
             parameters,
             ordered[bisect_left(stamps_ns, begin_ns) : bisect_left(stamps_ns, end_ns)],
             samples[
                 bisect_left(samples_ns, begin_ns - MARGIN_NS) : bisect_left(samples_ns, end_ns + MARGIN_NS)
             ],
         )
-        for finding in found.findings:
-            causes.setdefault(finding.cause, finding.text)
-    return "; ".join(causes.values())
+
+    parts = [checked(1 + part) for part in range(count)]
+    if len(parameters.prisms) >= MIN_PRISMS and any(part.findings for part in parts):
+        parts += [checked(0), checked(count + 1)]
+    causes: dict[str, str] = {}
+    for finding in (finding for part in parts for finding in part.findings):
+        causes.setdefault(finding.cause, finding.text)
+    return RecordedSetup("; ".join(causes.values()), any(part.confirmed for part in parts))

@@ -61,7 +61,7 @@ DISPLACEMENT_REMEDY = (
     "poses are degraded from then on, and their covariance allows for a turn by a degree; calibrate it again"
 )
 
-MOVED_REMEDY = "a tripod or prism may have moved, and the poses are invalid from then on; check the stations (tsgt calibrate check)"
+MOVED_REMEDY = "a tripod or prism may have moved, and the poses are {} from then on; check the stations (tsgt calibrate check)"
 
 MIN_TOLD = 8  # Measurements of each of three prisms that tell what happened before them; of a prism alone that it is the right one
 LONG_AFTER_S = 20.0
@@ -92,9 +92,10 @@ class ImuUse:
     noise_scales: FloatArray  # (S + 1, 3) factors on the stated noise of the measurements
     noise_scale: float  # Their root mean square over all measurements and components
     unused: tuple[UnusedInterval, ...]
-    # With fewer than three prisms: when a knock may have displaced it, and when a tripod or prism seems to have moved
-    displaced_from_s: float = np.inf
-    moved_from_s: float = np.inf
+    displaced_from_s: float = np.inf  # With fewer than three prisms: when a knock may have displaced it
+    moved_from_s: float = np.inf  # When a tripod or prism seems to have moved
+    shaken_from_s: float = np.inf  # First shock: what contradicts it from then on is no sign of a move
+    complete: bool = False  # Three prisms have poses without it, which are degraded where they contradict it, and else invalid
     odometry_samples: int = 0  # Of the wheel odometry that was used with it
 
     def unused_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
@@ -103,6 +104,19 @@ class ImuUse:
         for each in self.unused:
             found |= (time_s >= each.start_s) & (time_s <= each.end_s)
         return found
+
+    def disagrees_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
+        """(N,) whether it, a tripod or a prism may have moved at times, by measurements that contradict it without a shock."""
+        found: NDArray[np.bool_] = time_s > self.moved_from_s
+        for each in self.unused:
+            if each.reason == "contradiction" and each.start_s < self.shaken_from_s:
+                found |= (time_s >= each.start_s) & (time_s <= each.end_s)
+        return found
+
+    @property
+    def moved_remedy(self) -> str:
+        """What :attr:`moved_from_s` means for the poses, and what to do."""
+        return MOVED_REMEDY.format("degraded" if self.complete else "invalid")
 
     @property
     def unused_s(self) -> float:
@@ -189,6 +203,11 @@ def fit_with_imu(
             for each in contradicted
         ]
     _check_biases(found, imu.noise)
+    shocks_s, moved_s = shock_times_s(recorded), first_move_s(found)
+    shaken_s = float(shocks_s.min(initial=np.inf))
+    complete = not few_prisms and np.isinf(first_untold_s(observations, moved_s))
+    if complete and ((shocks_s > moved_s - LONG_AFTER_S) & (shocks_s < moved_s + WINDOW_S)).any():
+        moved_s = np.inf  # The IMU was knocked
     numbers = [station.station for station in parameters.stations]
     return ImuUse(
         tuple(numbers[row] for row in np.unique(observations.station) if row < len(numbers)),
@@ -197,8 +216,10 @@ def fit_with_imu(
         noise_scales,
         overall_scale(observations, noise_scales),
         (*missing, *contradicted, *unproven_intervals(found)),
-        first_untold_s(observations, min(first_shock_s(recorded), first_unwatched_s(recorded, start_s))),
-        first_untold_s(observations, first_move_s(found)),
+        first_untold_s(observations, min(shaken_s, first_unwatched_s(recorded, start_s))),
+        moved_s,
+        shaken_s,
+        complete,
         0 if wheels is None else len(wheels[0]),
     )
 
@@ -211,6 +232,8 @@ def first_untold_s(observations: Observations, from_s: float) -> float:
 
 def first_move_s(fit: InertialFit) -> float:
     """Return when a station seems to have moved, by successive measurements of its prism that contradict the IMU; else infinite.
+
+    Three prisms do not tell all of it: a tripod that sinks tilts the robot.
 
     The trajectory follows the station within two seconds, so that none is farther from it than :data:`OWN_PRISM_M`, as those
     of another prism are. A tripod moved by 20 mm gives 27 to 112, in one drive 22 and 34, which is not told from rain; one that has not
@@ -260,10 +283,10 @@ def first_unwatched_s(samples: InertialSamples, start_s: float) -> float:
     return float(samples.end_s[rows[0]]) if len(rows) else np.inf
 
 
-def first_shock_s(samples: InertialSamples) -> float:
-    """Return when the first shock was measured; infinite: there was none."""
+def shock_times_s(samples: InertialSamples) -> FloatArray:
+    """Return when shocks were measured."""
     _, shocks = judge_magnitudes(samples.angular_rate_radps, samples.specific_force_mps2)
-    return float(samples.end_s[shocks][0]) if shocks.any() else np.inf
+    return samples.end_s[shocks]
 
 
 def _check_biases(fit: InertialFit, noise: ImuNoise) -> None:

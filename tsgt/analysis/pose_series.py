@@ -70,7 +70,7 @@ class PoseSeries:
         """Return poses with an IMU; where it is not to be used those without it, or invalid ones.
 
         Where a shock may have displaced it they are degraded, and their covariance allows for that, as live; where a station seems to
-        have moved they are invalid.
+        have moved they are invalid, with three prisms degraded.
         """
         seen = self._history(imu.fit.residuals_m)
 
@@ -83,17 +83,22 @@ class PoseSeries:
                 epochs_ns, seen, states, covariance, common=common, converged=~imu.unused_at(time_s)
             )
             batch.degraded[displaced & batch.valid] |= Degradation.IMU_UNCONFIRMED
-            moved = batch.valid & (time_s > imu.moved_from_s)
-            batch.reason[moved], batch.degraded[moved] = Reason.CONTRADICTED, 0
+            if not imu.complete:
+                moved = batch.valid & (time_s > imu.moved_from_s)
+                batch.reason[moved], batch.degraded[moved] = Reason.CONTRADICTED, 0
             return batch
 
         poses = PoseBatch.collected(len(self._epochs_ns), map(chunk, _chunks(self._epochs_ns)))
-        if without is None:
-            return poses
-        unused = imu.unused_at(self._time_s(poses.stamp_ns))
-        rows = np.concatenate([np.flatnonzero(~unused), len(poses) + np.flatnonzero(unused)])
-        joined = PoseBatch.concatenated([poses, without]).select(rows)
-        return joined.select(np.argsort(joined.stamp_ns, kind="stable"))
+        if without is not None:
+            unused = imu.unused_at(self._time_s(poses.stamp_ns))
+            rows = np.concatenate([np.flatnonzero(~unused), len(poses) + np.flatnonzero(unused)])
+            joined = PoseBatch.concatenated([poses, without]).select(rows)
+            poses = joined.select(np.argsort(joined.stamp_ns, kind="stable"))
+        if imu.complete:
+            poses.degraded[poses.valid & imu.disagrees_at(self._time_s(poses.stamp_ns))] |= (
+                Degradation.IMU_DISAGREES
+            )
+        return poses
 
     def of_pieces(
         self, in_pieces: TrajectoryInPieces, on_progress: Callable[[float], None] | None, *, keep: bool

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from tsgt.analysis.imu_setup import wrong_imu_setup
-from tsgt.analysis.inertial_smoothing import fit_with_imu
+from tsgt.analysis.imu_setup import RecordedSetup, recorded_imu_setup
+from tsgt.analysis.inertial_smoothing import fit_with_imu, shock_times_s
 from tsgt.analysis.pose_series import PoseSeries
 from tsgt.analysis.refinement import refine_recorded_setup
 from tsgt.analysis.validation import (
@@ -21,8 +21,10 @@ from tsgt.analysis.validation import (
 )
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.estimation import (
+    Degradation,
     PoseBatch,
     build_observations,
+    inertial_samples,
     noise_scales,
     setup_jacobian,
     with_setup,
@@ -52,6 +54,12 @@ if TYPE_CHECKING:
     from tsgt.geometry.trajectory import Observations
     from tsgt.model import Measurement, MotionPrior, Parameters, PipelineParameters
     from tsgt.recording import Recording
+
+
+HAS_MOVED = (
+    "in a part of the drive its set-up is right, so that the IMU, a tripod or a prism may have moved: all poses are degraded; check the "
+    "stations (tsgt calibrate check)"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +168,7 @@ def _smoothed(
     """Return the poses, and the trajectory if the ``whole`` of it is to be kept, or an IMU was used."""
     prepared = _prepared(recording, path, refine)
     parameters, observations = prepared.parameters, prepared.observations
-    imu, imu_problem = _fit_imu(prepared, on_progress)
+    imu, imu_problem, has_moved = _fit_imu(prepared, on_progress)
     series = PoseSeries(parameters, prepared.measurements, prepared.sources, prepared.origin_ns)
     fit: TrajectoryFit | InertialFit | None = None if imu is None else imu.fit
     motion, without = prepared.motion, None
@@ -187,6 +195,8 @@ def _smoothed(
     else:
         assert without is not None  # noqa: S101 (else an error was raised)
         poses = without
+        if has_moved:
+            poses.degraded[poses.valid] |= Degradation.IMU_DISAGREES
     if not poses.valid.any():
         raise RecordingError(no_valid_pose_message(poses, parameters), path=path)
     found = SmoothedPoses(
@@ -246,25 +256,33 @@ def _has_imu(recording: Recording) -> bool:
     return recording.parameters.imu is not None and bool(recording.imu_samples)
 
 
-def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -> tuple[ImuUse | None, str]:
-    """Return the trajectory with the IMU, and why there is none although the recording has one.
+class _FittedImu(NamedTuple):
+    """The trajectory with the IMU, or why there is none although the recording has one."""
 
-    Raises RecordingError where there are no poses without it.
-    """
+    used: ImuUse | None
+    problem: str = ""
+    has_moved: bool = False  # Its set-up was right in a part of the drive: it, a tripod or a prism has moved
+
+
+def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -> _FittedImu:
+    """Return the trajectory with the IMU. Raises RecordingError where there is none, nor poses without it."""
     recording, parameters, path = prepared.recording, prepared.parameters, prepared.path
     if parameters.imu is None:
-        return None, ""
+        return _FittedImu(None)
     if not recording.imu_samples:
-        return None, "the recording has no IMU samples; give --imu, a file of tsgt import imu, or --no-imu"
+        return _FittedImu(
+            None, "the recording has no IMU samples; give --imu, a file of tsgt import imu, or --no-imu"
+        )
+    setup = RecordedSetup()
     if prepared.complete or len(parameters.prisms) < MIN_PRISMS:
-        problem = wrong_imu_setup(parameters, prepared.measurements, recording.imu_samples)
-        if problem and not prepared.complete:
+        setup = recorded_imu_setup(parameters, prepared.measurements, recording.imu_samples)
+        if setup.wrong and not prepared.complete:
             raise RecordingError(
-                f"{problem}; without three stations there are no poses without it: correct its set-up (--imu-setup)",
+                f"{setup.wrong}; without three stations there are no poses without it: correct its set-up (--imu-setup)",
                 path=path,
             )
-        if problem:
-            return None, problem
+        if setup.wrong:
+            return _left_out(setup.wrong, setup, recording, parameters)
     try:
         imu = fit_with_imu(
             parameters,
@@ -279,8 +297,16 @@ def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -
     except GeometryError as error:
         if not prepared.complete:
             raise RecordingError(f"{error}; --no-imu leaves the IMU out", path=path) from error
-        return None, str(error)
-    return imu, ""
+        return _left_out(str(error), setup, recording, parameters)
+    return _FittedImu(imu)
+
+
+def _left_out(problem: str, setup: RecordedSetup, recording: Recording, parameters: Parameters) -> _FittedImu:
+    """Return why the IMU is left out. A shock explains why its set-up is right in a part of the drive alone; else something may have moved."""
+    assert parameters.imu is not None  # noqa: S101 (the caller checks)
+    if not setup.confirmed or len(shock_times_s(inertial_samples(recording.imu_samples, parameters.imu, 0))):
+        return _FittedImu(None, problem)
+    return _FittedImu(None, f"{problem}; {HAS_MOVED}", has_moved=True)
 
 
 def estimate_motion_model(

@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 import tsgt
-from tsgt.analysis.inertial_smoothing import DISPLACEMENT_REMEDY, MOVED_REMEDY
+from tsgt.analysis.inertial_smoothing import DISPLACEMENT_REMEDY
 from tsgt.analysis.motion_plausibility import unfit_for_live
 from tsgt.analysis.processing import has_raw_angles, with_estimator
 from tsgt.analysis.refinement import Refine
@@ -282,7 +282,7 @@ def imu_text(found: SmoothedPoses) -> str | None:
     if np.isfinite(used.displaced_from_s):
         text += f"; from {used.displaced_from_s:.1f} s on a knock may have displaced it, because of a shock or of missing samples: {DISPLACEMENT_REMEDY}"
     if np.isfinite(used.moved_from_s):
-        text += f"; from {used.moved_from_s:.1f} s on measurements contradict it: {MOVED_REMEDY}"
+        text += f"; from {used.moved_from_s:.1f} s on measurements contradict it: {used.moved_remedy}"
     return text
 
 

@@ -15,7 +15,7 @@ from harness.inertial.imu_calibration import (
 )
 from harness.inertial.imu_recording import imu_recording, shaken_drive
 
-from tsgt.analysis.imu_setup import wrong_imu_setup
+from tsgt.analysis.imu_setup import RecordedSetup, recorded_imu_setup
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.errors import RecordingError
 
@@ -29,9 +29,13 @@ def test_wrong_setup_is_named() -> None:
     drive = uncalibrated_drive(60.0, seed=5)
     imu = calibrated_imu(drive)
     measurements, samples = point_measurements(drive), imu_records(drive)
-    assert wrong_imu_setup(parameters_of(drive, imu), measurements, samples) == ""
+    right = recorded_imu_setup(parameters_of(drive, imu), measurements, samples)
+    assert right.confirmed
+    assert not right.wrong
     late = parameters_of(drive, replace(imu, latency_ns=imu.latency_ns + 10_000_000))
-    assert "the latency of the IMU is wrong" in wrong_imu_setup(late, measurements, samples)
+    wrong = recorded_imu_setup(late, measurements, samples)
+    assert "the latency of the IMU is wrong" in wrong.wrong
+    assert not wrong.confirmed
 
 
 @pytest.mark.slow
@@ -50,5 +54,5 @@ def test_nothing_is_known_without_samples() -> None:
     """Nor without measurements."""
     drive = uncalibrated_drive(2.0)
     parameters = parameters_of(drive, drive.imu)
-    assert wrong_imu_setup(parameters, point_measurements(drive), []) == ""
-    assert wrong_imu_setup(parameters, [], imu_records(drive)) == ""
+    assert recorded_imu_setup(parameters, point_measurements(drive), []) == RecordedSetup()
+    assert recorded_imu_setup(parameters, [], imu_records(drive)) == RecordedSetup()

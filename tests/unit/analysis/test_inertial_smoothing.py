@@ -19,6 +19,8 @@ from tsgt.geometry import cartesian_to_polar, polar_to_cartesian
 from tsgt.model import PolarMeasurement, SetupCovariance
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from tsgt.analysis.smoothing import SmoothedRecording
     from tsgt.geometry import FloatArray
     from tsgt.model import Measurement
@@ -34,12 +36,12 @@ def smooth(recording: Recording) -> SmoothedRecording:
     return smooth_recording(recording, path=PATH, refine="off")
 
 
-def moved_measurement(measurement: Measurement, by_m: float) -> Measurement:
-    """Return what a station measures that was moved along its x axis."""
+def moved_measurement(measurement: Measurement, by_m: Sequence[float]) -> Measurement:
+    """Return what a station measures that was moved by a vector in its frame."""
     assert isinstance(measurement, PolarMeasurement)
     assert measurement.slope_distance_m is not None
     angles = measurement.horizontal_angle_rad, measurement.zenith_angle_rad
-    point = polar_to_cartesian(*angles, measurement.slope_distance_m) - np.array([by_m, 0.0, 0.0])
+    point = polar_to_cartesian(*angles, measurement.slope_distance_m) - by_m
     horizontal_rad, zenith_rad, distance_m = (float(each) for each in cartesian_to_polar(point))
     return replace(
         measurement,
@@ -47,6 +49,18 @@ def moved_measurement(measurement: Measurement, by_m: float) -> Measurement:
         zenith_angle_rad=zenith_rad,
         slope_distance_m=distance_m,
     )
+
+
+def shocked(recording: Recording, at_s: float) -> Recording:
+    """Return the recording with a sample of the IMU that no driving explains."""
+    at_ns = START + int(at_s * 1e9)
+    samples = [
+        replace(each, specific_force_mps2=((0.0, 90.0, 9.8), *each.specific_force_mps2[1:]))
+        if 0 <= each.stamp_ns[0] - at_ns < each.stamp_ns[-1] - each.stamp_ns[0]
+        else each
+        for each in recording.imu_samples
+    ]
+    return replace(recording, imu_samples=samples)
 
 
 def position_errors_m(found: SmoothedRecording) -> FloatArray:
@@ -86,6 +100,7 @@ def test_imu_that_contradicts_the_measurements_is_left_out() -> None:
     found = smooth(imu_recording(DRIVE, imu=wrong))
     assert found.imu is None
     assert "the mounting of the IMU is wrong by 4." in found.imu_problem
+    assert not (found.poses.degraded & Degradation.IMU_DISAGREES).any()
     assert 1e3 * np.sqrt((position_errors_m(found) ** 2).mean()) < 6.0
 
 
@@ -148,13 +163,7 @@ def test_poses_of_the_imu_are_those_of_its_frame() -> None:
 def test_poses_of_one_station_allow_for_a_shock_before_them(stations: int, *, displaced: bool) -> None:
     """It may have turned the IMU, which a single prism does not tell."""
     recording = imu_recording(DRIVE, stations=stations)
-    shock = [
-        replace(each, specific_force_mps2=((0.0, 90.0, 9.8), *each.specific_force_mps2[1:]))
-        if 0 <= each.stamp_ns[0] - START - 14 * 10**9 < each.stamp_ns[-1] - each.stamp_ns[0]
-        else each
-        for each in recording.imu_samples
-    ]
-    found = smooth(replace(recording, imu_samples=shock)).poses
+    found = smooth(shocked(recording, 14.0)).poses
     after = found.valid & (found.stamp_ns > START + 15 * 10**9)
     before = found.valid & (found.stamp_ns < START + 14 * 10**9)
     unconfirmed = (found.degraded & Degradation.IMU_UNCONFIRMED) != 0
@@ -185,7 +194,7 @@ def test_few_measurements_of_one_prism_between_outages_prove_nothing(stations: i
         return time_s < 8.0 or (measurement.station == 1 and 22.0 < time_s < 24.0)
 
     measurements = [
-        moved_measurement(each, 0.4) if each.stamp_ns > START + 20 * 10**9 else each
+        moved_measurement(each, [0.4, 0.0, 0.0]) if each.stamp_ns > START + 20 * 10**9 else each
         for each in filter(measured, recording.measurements)
     ]
     assert 3 <= sum(each.stamp_ns > START + 20 * 10**9 for each in measurements) < 8
@@ -245,7 +254,7 @@ def test_poses_of_a_single_station_that_has_moved_are_invalid(by_m: float, *, mo
     """From just before the move on: the trajectory follows the station, and nothing tells where it is."""
     recording = imu_recording(DRIVE, stations=1)
     measurements = [
-        moved_measurement(each, by_m) if each.stamp_ns > START + 14 * 10**9 else each
+        moved_measurement(each, [by_m, 0.0, 0.0]) if each.stamp_ns > START + 14 * 10**9 else each
         for each in recording.measurements
     ]
     found = smooth(replace(recording, measurements=measurements)).poses
@@ -265,12 +274,50 @@ def test_shock_is_told_by_three_prisms_after_it_alone(measured_s: float, *, disp
         for each in recording.measurements
         if each.station < 3 or each.stamp_ns < START + measured_s * 1e9
     ]
-    shock = [
-        replace(each, specific_force_mps2=((0.0, 90.0, 9.8), *each.specific_force_mps2[1:]))
-        if 0 <= each.stamp_ns[0] - START - 14 * 10**9 < each.stamp_ns[-1] - each.stamp_ns[0]
-        else each
-        for each in recording.imu_samples
-    ]
-    found = smooth(replace(recording, measurements=measurements, imu_samples=shock)).poses
+    found = smooth(shocked(replace(recording, measurements=measurements), 14.0)).poses
     after = found.valid & (found.stamp_ns > START + 15 * 10**9)
     assert ((found.degraded[after] & Degradation.IMU_UNCONFIRMED) != 0).all() == displaced
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("shock_s", "degraded"), [(None, True), (2.0, True), (23.8, False)])
+def test_poses_of_three_stations_are_degraded_once_one_has_sunk(
+    shock_s: float | None, *, degraded: bool
+) -> None:
+    """The triangle of the prisms stays what it was; the IMU tells, unless it was knocked itself."""
+    recording = imu_recording(shaken_drive(40.0))
+    measurements = [
+        moved_measurement(each, [0.0, 0.0, -0.03])
+        if each.station == 1 and each.stamp_ns > START + 24 * 10**9
+        else each
+        for each in recording.measurements
+    ]
+    recording = replace(recording, measurements=measurements)
+    found = smooth(recording if shock_s is None else shocked(recording, shock_s))
+    assert found.imu is not None
+    disagrees = (found.poses.degraded & Degradation.IMU_DISAGREES) != 0
+    after = found.poses.valid & (found.poses.stamp_ns > START + 24 * 10**9)
+    assert after.sum() > 200
+    assert disagrees[after].all() == degraded
+    assert not disagrees[found.poses.stamp_ns < START + 18 * 10**9].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("shock_s", "degraded"), [(None, True), (70.0, False)])
+def test_all_poses_are_degraded_where_the_set_up_is_right_in_a_part_of_the_drive(
+    shock_s: float | None, *, degraded: bool
+) -> None:
+    """Station 1 sinks in the middle, or the IMU was knocked there: it is left out."""
+    recording = imu_recording(shaken_drive(140.0))
+    measurements = [
+        moved_measurement(each, [0.0, 0.0, -0.03])
+        if each.station == 1 and each.stamp_ns > START + 70 * 10**9
+        else each
+        for each in recording.measurements
+    ]
+    recording = replace(recording, measurements=measurements)
+    found = smooth(recording if shock_s is None else shocked(recording, shock_s))
+    assert found.imu is None
+    assert ("in a part of the drive its set-up is right" in found.imu_problem) == degraded
+    disagrees = (found.poses.degraded & Degradation.IMU_DISAGREES) != 0
+    assert (disagrees[found.poses.valid] == degraded).all()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tsgt.analysis.figures import curve, panels_height_mm, stroke
-from tsgt.analysis.inertial_smoothing import DISPLACEMENT_REMEDY, MOVED_REMEDY
+from tsgt.analysis.inertial_smoothing import DISPLACEMENT_REMEDY
 from tsgt.analysis.report.page import ReportFigure, Section, Table, format_number
 from tsgt.geometry import log_so3, rotation_from_quaternion
 from tsgt.geometry.inertial import preintegrate
@@ -71,7 +71,7 @@ def imu_section(f: Findings, axis: TimeAxis) -> Section | None:
         )
     if np.isfinite(imu.moved_from_s):
         text.append(
-            f"From {format_number(imu.moved_from_s)} s on measurements contradict the IMU: {MOVED_REMEDY}."
+            f"From {format_number(imu.moved_from_s)} s on measurements contradict the IMU: {imu.moved_remedy}."
         )
     innovation = numbers["rotation_innovation_deg"]
     if innovation is not None:

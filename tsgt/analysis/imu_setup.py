@@ -6,13 +6,13 @@ from bisect import bisect_left
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tsgt.estimation import check_recorded_setup
+from tsgt.estimation import MOVE_CAUSES, check_recorded_setup
 from tsgt.model import MIN_PRISMS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tsgt.geometry.inertial_calibration import SetupCheck
+    from tsgt.geometry.inertial_calibration import Cause, SetupCheck
     from tsgt.model import ImuSamples, Measurement, Parameters
 
 PART_NS = 50_000_000_000
@@ -26,6 +26,7 @@ class RecordedSetup:
 
     wrong: str = ""  # Empty if nothing is known to be wrong
     confirmed: bool = False  # In one of the parts, at least
+    has_moved: bool = False  # It was right in one part, and another shows what a move of the IMU, a tripod or a prism changes
 
 
 def recorded_imu_setup(
@@ -55,7 +56,10 @@ def recorded_imu_setup(
     parts = [checked(1 + part) for part in range(count)]
     if len(parameters.prisms) >= MIN_PRISMS and any(part.findings for part in parts):
         parts += [checked(0), checked(count + 1)]
-    causes: dict[str, str] = {}
+    causes: dict[Cause, str] = {}
     for finding in (finding for part in parts for finding in part.findings):
         causes.setdefault(finding.cause, finding.text)
-    return RecordedSetup("; ".join(causes.values()), any(part.confirmed for part in parts))
+    confirmed = any(part.confirmed for part in parts)
+    return RecordedSetup(
+        "; ".join(causes.values()), confirmed, confirmed and not MOVE_CAUSES.isdisjoint(causes)
+    )

@@ -282,7 +282,7 @@ def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -
                 path=path,
             )
         if setup.wrong:
-            return _left_out(setup.wrong, setup, recording, parameters)
+            return _left_out(setup.wrong, recording, parameters, has_moved=setup.has_moved)
     try:
         imu = fit_with_imu(
             parameters,
@@ -297,14 +297,14 @@ def _fit_imu(prepared: _Prepared, on_progress: Callable[[float], None] | None) -
     except GeometryError as error:
         if not prepared.complete:
             raise RecordingError(f"{error}; --no-imu leaves the IMU out", path=path) from error
-        return _left_out(str(error), setup, recording, parameters)
+        return _left_out(str(error), recording, parameters, has_moved=setup.confirmed)
     return _FittedImu(imu)
 
 
-def _left_out(problem: str, setup: RecordedSetup, recording: Recording, parameters: Parameters) -> _FittedImu:
-    """Return why the IMU is left out. A shock explains why its set-up is right in a part of the drive alone; else something may have moved."""
+def _left_out(problem: str, recording: Recording, parameters: Parameters, *, has_moved: bool) -> _FittedImu:
+    """Return why the IMU is left out, which ``has_moved``, or a tripod or prism has, unless a shock shows that it was knocked."""
     assert parameters.imu is not None  # noqa: S101 (the caller checks)
-    if not setup.confirmed or len(shock_times_s(inertial_samples(recording.imu_samples, parameters.imu, 0))):
+    if not has_moved or len(shock_times_s(inertial_samples(recording.imu_samples, parameters.imu, 0))):
         return _FittedImu(None, problem)
     return _FittedImu(None, f"{problem}; {HAS_MOVED}", has_moved=True)
 

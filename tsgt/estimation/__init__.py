@@ -7,6 +7,7 @@ hold and validate poses; `reference_point` carries them to another point of the 
 """
 
 from tsgt.estimation.inertial import (
+    MOVE_CAUSES,
     UNCONFIRMED_SIGMAS,
     UNWATCHED_NS,
     ImuSetupMonitor,
@@ -57,6 +58,7 @@ from tsgt.estimation.tracks import (
 
 __all__ = [
     "MAX_DISTANCE_M",
+    "MOVE_CAUSES",
     "POINT_COMMENT",
     "UNCONFIRMED_SIGMAS",
     "UNWATCHED_NS",

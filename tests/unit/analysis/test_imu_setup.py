@@ -36,6 +36,7 @@ def test_wrong_setup_is_named() -> None:
     wrong = recorded_imu_setup(late, measurements, samples)
     assert "the latency of the IMU is wrong" in wrong.wrong
     assert not wrong.confirmed
+    assert not wrong.has_moved
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from tsgt.estimation.inertial.selection import (
     OdometryState,
 )
 from tsgt.estimation.inertial.setup_monitor import (
+    MOVE_CAUSES,
     UNWATCHED_NS,
     ImuSetupMonitor,
     StartCheck,
@@ -20,6 +21,7 @@ from tsgt.estimation.inertial.setup_monitor import (
 from tsgt.estimation.inertial.wheels import wheel_samples
 
 __all__ = [
+    "MOVE_CAUSES",
     "UNCONFIRMED_SIGMAS",
     "UNWATCHED_NS",
     "ImuSetupMonitor",

@@ -85,7 +85,8 @@ _REMEDIES: dict[Cause, str] = {
     "latency": "calibrate it: tsgt calibrate imu; or check the clock of the computer that stamps the samples",
     "unrelated": "check which device the program reads, and its clock",
 }
-_MOVED: frozenset[Cause] = frozenset({"rotation", "position"})
+MOVE_CAUSES: frozenset[Cause] = frozenset({"rotation", "position"})
+"""Errors of the set-up that come about when the IMU, a tripod or a prism moves."""
 _REMEDY_IF_MOVED = "it was right before, so the IMU, a tripod or a prism has moved: tsgt calibrate check tells whether it was a tripod"
 
 
@@ -201,7 +202,7 @@ class ImuSetupMonitor:
     @property
     def may_have_moved(self) -> bool:
         """Whether a set-up that was confirmed is wrong now in what a move of the IMU, a tripod or a prism changes."""
-        return self._was_confirmed and not _MOVED.isdisjoint(self._standing)
+        return self._was_confirmed and not MOVE_CAUSES.isdisjoint(self._standing)
 
     @property
     def unconfirmed(self) -> str:
@@ -280,7 +281,7 @@ class ImuSetupMonitor:
             del self._standing[cause]
         for finding in check.findings:
             if finding.cause not in self._standing:
-                has_moved = self._was_confirmed and finding.cause in _MOVED
+                has_moved = self._was_confirmed and finding.cause in MOVE_CAUSES
                 message = f"{finding.text}; {_REMEDY_IF_MOVED if has_moved else _REMEDIES[finding.cause]}"
                 self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_wrong", message=message))
             self._standing[finding.cause] = finding

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -72,6 +73,8 @@ def run(mission: Mission, stations: int, arguments: argparse.Namespace, *, gyro_
         rows &= ~outages(mission.observations.time_s, arguments.outage)
     order = np.flatnonzero(rows)[np.argsort(mission.arrival_s[rows], kind="stable")]
     observations, arrival_s = mission.observations.select(order), mission.arrival_s[order]
+    # With a layout of others, a prism measured alone would have to be confirmed by them.
+    observations = replace(observations, layout=observations.layout[:stations])
     samples, sampled_s = mission.samples, mission.line_arrival_s
     if arguments.line:
         last = np.minimum((np.arange(len(samples)) // arguments.line + 1) * arguments.line, len(samples)) - 1

@@ -52,6 +52,9 @@ _STATES = (
 )
 """Events that replace each other: what begins a state, what changes and what ends it."""
 
+_ENDED_BY_SETUP = {"layout_residual_high", "imu_setup_wrong", "station_contradicted"}
+"""States of the set-up in force, which ``setup_applied`` ends."""
+
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
@@ -108,6 +111,8 @@ class AlarmLimiter:
     def _drop_replaced(self, event: EventRecord, name: str) -> None:
         """Drop what is held back of a state that an event changes."""
         state: set[str] = next((each for each in _STATES if event.event in each), set())
+        if event.event == "setup_applied":
+            state = _ENDED_BY_SETUP
         for (other, station, other_name), subject in self._subjects.items():
             same = other_name == name and (station == event.station or None in (station, event.station))
             if other in state and other != event.event and same and subject.held is not None:

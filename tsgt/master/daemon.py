@@ -112,9 +112,14 @@ async def run_through_suspensions(
     After a suspension of the computer everything restarts: recording, session with the stations, timeline.
     """
     suspended: ComputerSuspendedError | None = None
+
+    def keep(applied: Parameters) -> None:
+        nonlocal parameters
+        parameters = applied
+
     while True:
         suspended = await service.until_suspended(
-            run_master(config, parameters, settings, dependencies, suspended)
+            run_master(config, parameters, settings, dependencies, suspended, keep)
         )
         log.warning("computer_resumed", for_s=round(suspended.for_s, 3))
         if dependencies.read_setup is not None:
@@ -128,10 +133,11 @@ async def run_master(
     settings: LoRaSettings,
     dependencies: MasterDependencies,
     suspended: ComputerSuspendedError | None = None,
+    on_set_up: Callable[[Parameters], None] = lambda _: None,
 ) -> None:
     """Receive, compute, stream and record until cancelled; ``parameters`` are those in force.
 
-    ``suspended``: the computer has just been suspended; an event says so.
+    ``suspended``: the computer has just been suspended; an event says so. ``on_set_up`` is called with those that replace them.
 
     Raises RecordingError if the recording cannot be opened. Raises StreamError if the socket cannot be opened. Raises
     ComputerSuspendedError, in a group, after a suspension, before anything is published or recorded: times of CLOCK_MONOTONIC from
@@ -210,6 +216,7 @@ async def run_master(
                 link = _link(config, hints, settings, timeline, recording, publisher, dependencies)
 
                 def set_up(found: Parameters) -> None:
+                    on_set_up(found)
                     publisher.set_up(found, observers(found), recording.put)
                     hints.set_up(found)
                     server.greet_with(encode_line(HelloRecord.of(found)))

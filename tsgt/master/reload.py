@@ -64,3 +64,6 @@ def reloading(
         yield
     finally:
         loop.remove_signal_handler(RELOAD_SIGNAL)
+        signal.signal(
+            RELOAD_SIGNAL, signal.SIG_IGN
+        )  # the default would kill the master while it ends or restarts

@@ -148,8 +148,11 @@ class StreamServer:
         if self._closing:
             return _RejectedConnection()
         return _Reader(
-            self._readers, self._changed, self._greeting + self._setup, self._queue_lines, self._unix_now_ns
+            self._readers, self._changed, self._present_greeting, self._queue_lines, self._unix_now_ns
         )
+
+    def _present_greeting(self) -> bytes:
+        return self._greeting + self._setup
 
 
 class _RejectedConnection(asyncio.Protocol):
@@ -166,7 +169,7 @@ class _Reader(asyncio.Protocol):
         self,
         readers: set[_Reader],
         changed: asyncio.Event,
-        greeting: bytes,
+        greeting: Callable[[], bytes],
         queue_lines: int,
         unix_now_ns: Callable[[], int],
     ) -> None:
@@ -215,7 +218,7 @@ class _Reader(asyncio.Protocol):
             log.warning("reader_refused", readers=len(self._readers))
             self.abort()
             return
-        self._transport.write(self._greeting)
+        self._transport.write(self._greeting())
         self._readers.add(self)
         self._changed.set()
         log.info("reader_connected", readers=len(self._readers))

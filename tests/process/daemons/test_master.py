@@ -113,6 +113,14 @@ def test_master_without_calibration_takes_it_while_running(config: Path) -> None
                 while names[-1] != "setup_rejected":
                     names.append(next(events)["event"])
                 assert "setup_applied" in names
+            frames.rename(folder / "edited.toml")
+            config.write_text(config.read_text().replace(frames.name, "edited.toml"))
+            targets.write_text(TARGETS.replace(",18.0,", ",18.01,"))
+            frames.write_text(kept)
+            applied = tsgt("calibrate", "targets", str(targets), "--apply", str(config))
+            assert "are not those of" in applied.stderr
+            assert "restart it" in applied.stderr
+            assert applied.returncode == 1
             with connected(folder / "poses.sock", daemon) as reader, reader.makefile("rb") as lines:
                 hello, setup = (json.loads(lines.readline()) for _ in range(2))
             assert "no_poses" not in hello

@@ -110,6 +110,17 @@ def test_what_ends_a_state_names_no_station_where_it_concerns_all() -> None:
     assert limit.due(100 * SECOND) == []
 
 
+@pytest.mark.parametrize("name", ["layout_residual_high", "imu_setup_wrong", "station_contradicted"])
+def test_new_set_up_ends_what_was_wrong_with_the_old_one(name: str) -> None:
+    """The master is not to be reported as wrong after it took another set-up."""
+    limit = AlarmLimiter([name], 60 * SECOND)
+    wrong = replace(LOST, event=name)
+    assert limit.take(wrong, 0) == [Alarm(wrong)]
+    assert limit.take(wrong, 10 * SECOND) == []
+    assert limit.take(replace(wrong, event="setup_applied", station=None), 20 * SECOND) == []
+    assert limit.due(100 * SECOND) == []
+
+
 def test_alarm_is_the_line_of_the_event_with_the_site() -> None:
     """Whatever the name of the site."""
     line = json.loads(Alarm(LOST, suppressed=3).line('Steinbruch "Süd"\n'))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import signal
 import socket
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -25,7 +26,7 @@ from tsgt.errors import ComputerSuspendedError, ConfigError, RadioError, StreamE
 from tsgt.geometry import rotation_from_quaternion
 from tsgt.master.monitors.geofence import run_geofence_command
 from tsgt.master.monitors.imu import ImuUseMonitor
-from tsgt.master.reload import RELOAD_SIGNAL
+from tsgt.master.reload import RELOAD_SIGNAL, reloading
 from tsgt.master.replay import greeting, replayed
 from tsgt.model import ImuSamples, PolarMeasurement, Status
 from tsgt.recording import (
@@ -327,6 +328,13 @@ async def test_use_of_the_imu_is_watched_anew_with_a_new_set_up(tmp_path: Path) 
     assert made.call_count == 2
 
 
+async def test_signal_is_ignored_while_the_master_ends() -> None:
+    """Or restarts after a suspension: its default ends the process."""
+    with reloading(lambda: DRIVING.parameters, lambda _: None, lambda _: None):
+        pass
+    assert signal.getsignal(RELOAD_SIGNAL) == signal.SIG_IGN
+
+
 COLLINEAR = replace(
     DRIVING.parameters,
     prisms=tuple(
@@ -361,22 +369,27 @@ async def test_unusable_set_up_leaves_the_old_one(tmp_path: Path, found: ConfigE
 async def test_unusable_set_up_after_a_suspension_leaves_the_old_one(
     tmp_path: Path, found: ConfigError | Parameters
 ) -> None:
-    """The master restarts with what was in force before."""
+    """The master restarts with what was in force before: not the set-up of its start, which a reload has replaced."""
     suspended_ns = 0
+    at_start = replace(DRIVING.parameters, prisms=DRIVING.parameters.prisms[::-1])
 
     def read_setup() -> Parameters:
+        if not suspended_ns:
+            return DRIVING.parameters
         if isinstance(found, ConfigError):
             raise found
         return found
 
     async with (
         field_of(tmp_path, DRIVING) as field,
-        running(field.master(read_setup=read_setup, suspended_ns=lambda: suspended_ns)),
+        running(field.master(parameters=at_start, read_setup=read_setup, suspended_ns=lambda: suspended_ns)),
     ):
+        await asyncio.sleep(5)
+        os.kill(os.getpid(), RELOAD_SIGNAL)
         await asyncio.sleep(5)
         suspended_ns = 8_000_000_000
         await asyncio.sleep(12)
-    assert events(field)[-1] == "computer_resumed"
+    assert events(field) == ["setup_applied", "computer_resumed"]
     assert field.of(PoseRecord)[-1].valid
     assert load_recording(field.recording()).parameters == DRIVING.parameters
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tsgt.analysis.compare.alignment import fit, nested_fits
+from tsgt.analysis.compare.alignment import OffsetSearchError, fit, nested_fits
 from tsgt.analysis.compare.alignment.uncertainty import WEAK_SIGMA
 from tsgt.analysis.compare.assessment import MIN_POSES, Assessment, assess, paired
 from tsgt.analysis.compare.checks import input_findings, quaternion_finding, relative_offset_s
@@ -76,6 +76,7 @@ class Comparison:
     settings, fit, errors : What was asked for: the headline.
     steps : Growing sets of fitted quantities, from none (unless both overlap by a fitted offset only) to all.
     smallest_fair : Index of the smallest fair set in ``steps``.
+    relative_times : Whether its times are no Unix times: the offset is that of this drive alone.
     warnings : What is doubtful about the estimate's times and units.
     """
 
@@ -85,6 +86,7 @@ class Comparison:
     errors: Assessment
     steps: tuple[FitStep, ...]
     smallest_fair: int
+    relative_times: bool
     warnings: tuple[str, ...]
 
     @property
@@ -219,7 +221,14 @@ def compare_estimate(
         align="yaw" if settings.align == "yaw" else "rigid",
     )
     try:
-        nested = nested_fits(reference, estimate, everything, start)
+        try:
+            nested = nested_fits(reference, estimate, everything, start)
+        except OffsetSearchError as problem:
+            if "offset" in settings.parts:
+                raise
+            everything = replace(everything, parts=everything.parts - {"offset"})
+            nested = nested_fits(reference, estimate, everything, start)
+            warnings += (f"compared at the times of its stamps, but {problem.finding}",)
     except ValueError as problem:  # as a GeometryError is, too
         raise GeometryError(str(problem)) from problem
     wrong = quaternion_finding(reference, estimate, nested[-1][1].relation.offset_s)
@@ -243,6 +252,7 @@ def compare_estimate(
         ),
         steps=steps,
         smallest_fair=_smallest_fair(steps),
+        relative_times=relative_offset_s(reference, estimate) is not None,
         warnings=warnings,
     )
 

@@ -42,9 +42,10 @@ def cautions(each: Comparison) -> list[str]:
         lines.append(f"{len(c.jumps)} jump{plural} of {1e3 * worst.position_m:.0f} mm")
     fair = each.steps[each.smallest_fair]
     own = each.errors.ate.errors.position_mm.rms
-    if "extrinsic" in fair.settings.parts - each.settings.parts:
+    with_extrinsic = fair.ate.errors.position_mm.rms
+    if "extrinsic" in fair.settings.parts - each.settings.parts and with_extrinsic < own:
         lines.append(
-            f"the extrinsic is not fitted: with it the error falls from {own:.1f} to {fair.ate.errors.position_mm.rms:.1f} mm; "
+            f"the extrinsic is not fitted: with it the error falls from {own:.1f} to {with_extrinsic:.1f} mm; "
             "use `--fit offset,extrinsic`, or `--extrinsic FILE`"
         )
     nees = each.errors.nees

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
 
     from tsgt.geometry import FloatArray
 
-PATH_TOLERANCE = 0.1  # As in evo
-TIME_TOLERANCE = 0.01  # Epochs are regular
-STEP_TOLERANCE = 0.5  # Of the median step: the last poses have no partner
+PATH_TOLERANCE = TIME_TOLERANCE = 0.1  # As in evo
+STEP_TOLERANCE = 0.51  # Of the median step: half a step at any rate, but the last poses have no partner
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,25 +128,25 @@ def write_sensor_mounting(
     T_point_sensor: FloatArray,
     sigma: FloatArray,
     *,
-    offset_s: float,
+    offset_s: float | None,
     offset_sigma_s: float,
     comment: str,
 ) -> None:
     """Write a file of kind ``sensor_mounting``, atomically. Raises OutputFileError if the file cannot be written.
 
-    ``sigma``: (6,) of position and rotation in the axes of the point; NaN, as of the offset: unknown.
+    ``sigma``: (6,) of position and rotation in the axes of the point; NaN, as of the offset: unknown. ``offset_s`` None: it says nothing
+    of other drives, and is not written.
     """
     content: dict[str, Any] = {
         "kind": "sensor_mounting",
         "position_m": [round(each, 7) for each in T_point_sensor[:3, 3].tolist()],
         "orientation_xyzw": quaternion_from_rotation(T_point_sensor[:3, :3]).tolist(),
-        "offset_ms": round(1e3 * offset_s, 6),
     }
-    for key, part in (
-        ("position_sigma_mm", 1e3 * sigma[:3]),
-        ("rotation_sigma_deg", np.degrees(sigma[3:])),
-        ("offset_sigma_ms", np.array([1e3 * offset_sigma_s])),
-    ):
+    sigmas = [("position_sigma_mm", 1e3 * sigma[:3]), ("rotation_sigma_deg", np.degrees(sigma[3:]))]
+    if offset_s is not None:
+        content["offset_ms"] = round(1e3 * offset_s, 6)
+        sigmas.append(("offset_sigma_ms", np.array([1e3 * offset_sigma_s])))
+    for key, part in sigmas:
         if np.isfinite(part).all():
             content[key] = part.tolist() if len(part) > 1 else float(part[0])
     _write(path, content, None, comment)

@@ -238,15 +238,17 @@ def _compare(
 
 
 def _write_mounting(path: Path, found: Comparison, reference: Path) -> None:
-    sigma = found.extrinsic_sigma
-    if "extrinsic" in found.settings.parts:
+    sigma, prior = found.extrinsic_sigma, found.settings.extrinsic_prior
+    if prior is not None:  # What was not fitted is known as well as before
+        sigma = np.where(np.isfinite(sigma), sigma, prior.sigma)
+    elif "extrinsic" in found.settings.parts:
         unknown = np.array([UNKNOWN_POSITION_MM / 1e3] * 3 + [math.radians(UNKNOWN_ROTATION_DEG)] * 3)
         sigma = np.where(np.isfinite(sigma), sigma, unknown)
     write_sensor_mounting(
         path,
         found.fit.relation.T_point_sensor,
         sigma,
-        offset_s=found.fit.relation.offset_s,
+        offset_s=None if found.relative_times else found.fit.relation.offset_s,
         offset_sigma_s=float(found.sigma("offset_s")[0]),
         comment=f"written by tsgt compare {reference} {found.estimate.source}",
     )

@@ -11,7 +11,9 @@ from tsgt.analysis.compare import (
     ExtrinsicPrior,
     FitSettings,
     FittedPart,
+    ReferencePoses,
     Relation,
+    compare_estimate,
     fit,
     nested_fits,
     overlap_s,
@@ -120,17 +122,45 @@ def test_offset_beyond_the_search_is_refused() -> None:
         fit(long_reference(), noisy(seen(np.arange(40.0, 80.0, 0.1), true), 1), replaced(settings, 5.0))
 
 
-def test_offset_of_a_motion_that_repeats_itself_is_refused() -> None:
-    """Laps of 30 s: any of them may be meant; the search can be narrowed."""
+def laps_of_30_s() -> tuple[ReferencePoses, Estimate]:
+    """Return a motion that repeats itself."""
     made = long_reference()
     phase = 2 * np.pi * np.arange(len(made.stamp_ns)) / 600
     path = np.stack([8 * np.sin(phase), 6 * np.cos(2 * phase), 0 * phase], axis=1)
     laps = dataclasses.replace(made, T_station1_point=transform_from(np.eye(3), path))
-    estimate = Estimate("laps", made.stamp_ns[800:1400:2], path[800:1400:2], None, None)
+    return laps, Estimate("laps", made.stamp_ns[800:1400:2], path[800:1400:2], None, None)
+
+
+def test_offset_of_a_motion_that_repeats_itself_is_refused() -> None:
+    """Any of the laps may be meant; the search can be narrowed."""
+    laps, estimate = laps_of_30_s()
     settings = FitSettings(EVERYTHING, "rigid")
     with pytest.raises(ValueError, match="about as well at a time offset of"):
         fit(laps, estimate, settings)
     assert abs(fit(laps, estimate, replaced(settings, 5.0)).relation.offset_s) < 0.01
+
+
+def test_offset_that_is_not_asked_for_need_not_be_found() -> None:
+    """Clocks that are known: a note says that the motion does not confirm them."""
+    found = compare_estimate(*laps_of_30_s(), FitSettings(frozenset(), "none"))
+    assert found.errors.ate.errors.position_mm.rms < 1e-6
+    assert all("offset" not in each.settings.parts for each in found.steps)
+    assert any("at the times of its stamps, but" in each for each in found.warnings)
+
+
+def test_aligned_robot_at_rest_is_turned_as_its_orientations_say() -> None:
+    """Noise of its positions has no direction."""
+    made = reference(40.0)
+    rng = np.random.default_rng(6)
+    still = transform_from(np.eye(3), rng.normal(0.0, 1e-4, (len(made.stamp_ns), 3)))
+    seen_m = rng.normal(0.0, 3e-3, (len(made.stamp_ns), 3))
+    turned = Rotation.from_euler("z", 0.7).as_matrix()
+    orientation = np.tile(quaternion_from_rotation(turned), (len(seen_m), 1))
+    estimate = Estimate("still", made.stamp_ns[20:-20], seen_m[20:-20], orientation[20:-20], None)
+    for align_by in ("rigid", "yaw"):
+        settings = FitSettings(EVERYTHING, align_by)
+        found = fit(dataclasses.replace(made, T_station1_point=still), estimate, settings).relation
+        np.testing.assert_allclose(found.T_station1_frame[:3, :3], turned.T, atol=1e-6)
 
 
 def test_offset_of_a_robot_at_rest_is_unobservable() -> None:
@@ -219,11 +249,11 @@ def test_vertical_lever_arm_is_unobservable_on_level_ground() -> None:
 
 
 def test_what_a_smoother_takes_off_the_motion_does_not_bias_the_lever_arm() -> None:
-    """The truth rocks about the prisms by 8 mrad more than the reference, independently of it, as the covariance says."""
+    """The truth rocks by 16 mrad, and about the prisms by 8 mrad more than the reference, independently of it, as the covariance says."""
     made = reference(60.0)
     n, centroid_m = len(made.stamp_ns), np.array([0.0, 0.0, 1.2])
     heading = np.arctan2(made.T_station1_point[:, 1, 0], made.T_station1_point[:, 0, 0])
-    known, missed = (exp_so3(0.008 * rocking(n, seed)) for seed in (1, 2))
+    known, missed = (exp_so3(size * rocking(n, seed)) for seed, size in ((1, 0.016), (2, 0.008)))
     smoothed = transform_from(
         known @ exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0])), made.T_station1_point[:, :3, 3]
     )
@@ -238,6 +268,73 @@ def test_what_a_smoother_takes_off_the_motion_does_not_bias_the_lever_arm() -> N
         FitSettings(EVERYTHING, "rigid"),
     )
     assert abs(found.relation.T_point_sensor[2, 3] - EXTRINSIC[2, 3]) < 0.05
+
+
+@pytest.mark.parametrize("height_m", [0.6, 2.0])
+def test_noise_of_the_reference_does_not_tell_the_height_on_level_ground(height_m: float) -> None:
+    """Its rotation jitters by 3 mrad, correlated over a fifth of a second, which is no motion of the robot."""
+    made = reference(120.0)
+    n = len(made.stamp_ns)
+    heading = np.arctan2(made.T_station1_point[:, 1, 0], made.T_station1_point[:, 0, 0])
+    level = transform_from(
+        exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0])),
+        made.T_station1_point[:, :3, 3] * [1.0, 1.0, 0.0],
+    )
+    extrinsic = EXTRINSIC.copy()
+    extrinsic[2, 3] = height_m
+    sensor = (level @ extrinsic)[20:-20:2]
+    estimate = noisy(
+        Estimate(
+            "flat",
+            made.stamp_ns[20:-20:2],
+            sensor[:, :3, 3],
+            quaternion_from_rotation(sensor[:, :3, :3]),
+            None,
+        ),
+        5,
+    )
+    jittering = transform_from(level[:, :3, :3] @ exp_so3(0.003 * rocking(n, 4)), level[:, :3, 3])
+    found = fit(
+        dataclasses.replace(made, T_station1_point=jittering), estimate, FitSettings(EVERYTHING, "rigid")
+    )
+    assert "extrinsic_z_m" in found.unobservable
+    assert found.relation.T_point_sensor[2, 3] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rotation_about_a_straight_line_of_travel_is_left_as_given(seed: int) -> None:
+    """Nothing tells it, and the search for a first guess finds any."""
+    made = reference(60.0)
+    speed = 1.2 + 0.8 * rocking_slowly(len(made.stamp_ns), seed)
+    way_m = np.cumsum(np.clip(speed, 0.0, 3.0)) * 0.05
+    straight = transform_from(
+        np.broadcast_to(exp_so3(np.array([0.0, 0.0, 0.3])), (len(way_m), 3, 3)),
+        way_m[:, None] * np.array([np.cos(0.3), np.sin(0.3), 0.0]),
+    )
+    sensor = straight[20:-20:2] @ transform_from(np.eye(3), EXTRINSIC[:3, 3])
+    estimate = noisy(
+        Estimate(
+            "seen",
+            made.stamp_ns[20:-20:2],
+            sensor[:, :3, 3],
+            quaternion_from_rotation(sensor[:, :3, :3]),
+            None,
+        ),
+        seed,
+    )
+    found = fit(
+        dataclasses.replace(made, T_station1_point=straight), estimate, FitSettings(EVERYTHING, "rigid")
+    )
+    assert "extrinsic_roll_rad" in found.unobservable
+    assert np.abs(log_so3(found.relation.T_point_sensor[:3, :3])).max() < 0.01
+    offset_sigma_s = float(np.sqrt(found.covariance[0, 0]))
+    assert offset_sigma_s < 0.01
+
+
+def rocking_slowly(n: int, seed: int) -> FloatArray:
+    """Return a smooth random number of unit variance at 20 Hz, correlated over seconds, (N,)."""
+    found = gaussian_filter1d(np.random.default_rng(seed).normal(size=n), 25.0)
+    return np.asarray(found / found.std())
 
 
 def rocking(n: int, seed: int) -> FloatArray:

@@ -114,6 +114,15 @@ def test_all_pairs_are_the_closest_within_a_tenth() -> None:
     assert pairs_by_path(position_m, 1.0, all_pairs=True).tolist() == [[0, 2], [1, 5]]
 
 
+@pytest.mark.parametrize("rate_hz", [2.0, 7.0, 9.5, 12.3, 20.0, 20.7, 200.0])
+def test_pairs_by_time_at_any_rate(rate_hz: float) -> None:
+    """Each pose has the closest one, but for those of the last second."""
+    stamp_ns = np.round(1e9 * np.arange(400) / rate_hz).astype(np.int64)
+    pairs = pairs_by_time(stamp_ns, 1.0)
+    assert 400 - math.ceil(rate_hz) <= len(pairs) <= 400 - math.floor(rate_hz)
+    assert np.ptp(pairs[:, 1] - pairs[:, 0]) <= 1
+
+
 def test_pairs_by_time_do_not_span_a_gap() -> None:
     """Poses without one a second later have no pair."""
     stamp_ns = np.array([0, 500, 1000, 1500, 4000, 5000]) * 1_000_000

@@ -15,6 +15,7 @@ from harness.drives.paired import drive, noisy
 from harness.files.cli import called
 from scipy.spatial.transform import Rotation
 
+from tsgt.config import SensorMountingFile, load
 from tsgt.geometry import invert, quaternion_from_rotation, transform_from
 
 if TYPE_CHECKING:
@@ -141,6 +142,39 @@ def test_mounting_is_written_and_used_again(
     assert held["align"] == "start"
     assert np.array(held["extrinsic"]) == pytest.approx(np.array(each["extrinsic"]), abs=1e-6)
     assert held["ate"]["position_rms_mm"] == pytest.approx(each["ate"]["position_rms_mm"], rel=0.05)
+
+
+def test_written_mounting_keeps_what_was_known(
+    tsgt: Tsgt, reference: Path, lidar: Path, fitted: dict[str, Any], tmp_path: Path
+) -> None:
+    """A position that the given file holds exactly was not fitted, and is as exact afterwards."""
+    del fitted
+    given, written = tmp_path / "given.toml", tmp_path / "written.toml"
+    lines = reference.with_name("lidar.toml").read_text().splitlines(keepends=True)
+    first = next(row for row, line in enumerate(lines) if line.startswith("position_sigma_mm"))
+    given.write_text(
+        "".join(lines[:first]) + "position_sigma_mm = [0.0, 0.0, 0.0]\n" + "".join(lines[first + 5 :])
+    )
+    for parts in ("offset,extrinsic", "offset"):
+        outcome = tsgt("compare", reference, lidar, "--extrinsic", given, "--fit", parts, "--output", written)
+        assert outcome.code == 0, outcome.err
+        mounting = load(written, SensorMountingFile)
+        assert mounting.position_sigma_mm == (0.0, 0.0, 0.0)
+        assert mounting.rotation_sigma_deg is not None
+        assert max(mounting.rotation_sigma_deg) < 1.0
+
+
+def test_offset_of_relative_times_is_not_written(
+    tsgt: Tsgt, reference: Path, lidar: Path, tmp_path: Path
+) -> None:
+    """It would say nothing of another drive, and no file could hold it."""
+    relative, written = tmp_path / "relative.tum", tmp_path / "relative.toml"
+    lines = [line.split() for line in lidar.read_text().splitlines()]
+    relative.write_text("".join(f"{float(time) - START_S + 1.0:.9f} {' '.join(rest)}\n" for time, *rest in lines))
+    options = ("--fit", "offset,extrinsic", "--output", written)
+    assert tsgt("compare", reference, relative, *options).code == 0
+    assert "offset_ms" not in written.read_text()
+    assert tsgt("compare", reference, relative, "--extrinsic", written).code == 0
 
 
 def test_errors_are_written_as_csv(reference: Path, fitted: dict[str, Any]) -> None:

@@ -6,6 +6,6 @@ over a chosen part; `uncertainty` says what the motion determines; `fitting` put
 """
 
 from tsgt.analysis.compare.alignment.fitting import fit, nested_fits
-from tsgt.analysis.compare.alignment.initialisation import overlap_s
+from tsgt.analysis.compare.alignment.initialisation import OffsetSearchError, overlap_s
 
-__all__ = ["fit", "nested_fits", "overlap_s"]
+__all__ = ["OffsetSearchError", "fit", "nested_fits", "overlap_s"]

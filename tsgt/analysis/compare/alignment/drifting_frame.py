@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.analysis.compare.interpolation import MAX_GAP_NS
 from tsgt.geometry import exp_so3, log_so3, rotate, rotation_from_quaternion, skew
 from tsgt.geometry.trajectory.block_tridiagonal import BlockCholesky, factorise
 
@@ -134,7 +135,8 @@ def rows_of(estimate: Estimate, usable: NDArray[np.bool_], min_step_s: float) ->
     since_s = (estimate.stamp_ns - estimate.stamp_ns[0]) / 1e9
     if len(row) < MIN_ROWS or since_s[row[-1]] - since_s[row[0]] < MIN_SPAN_S:
         raise ValueError(
-            f"a fit needs at least {MIN_ROWS} poses over {MIN_SPAN_S:g} s inside the reference, there are {len(row)}"
+            f"a fit needs at least {MIN_ROWS} poses over {MIN_SPAN_S:g} s inside the reference, there are {len(row)}; the reference is "
+            f"interpolated between valid poses that are at most {MAX_GAP_NS / 1e9:g} s apart"
         )
     row = row[_first_of_each(np.floor(since_s[row] / min_step_s))]
     knot = _first_of_each(np.floor(since_s[row] / KNOT_STEP_S))

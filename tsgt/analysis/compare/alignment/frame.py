@@ -23,6 +23,9 @@ START_S = 5.0
 START_SPREAD_M = 5.0
 """Of positions alone, the start lasts until they spread by as much along a horizontal line: before, they show no direction."""
 
+REST_SPREAD_M = 0.05
+"""Rms distance from their mean, below which positions show no direction, but orientations do."""
+
 OUTLIER_RATIO = 5.0  # Of the median distance; drift alone stays below 3
 LINE_RATIO = (
     1e-3  # Spread of positions across a line to that along it, below which they leave a rotation open
@@ -55,7 +58,8 @@ def align_frame(
 ) -> AlignedFrame:
     """Align the estimate's scaled positions, (N, 3), and rotations to the sensor's reference poses, (N, 4, 4).
 
-    ``weight``: (N,), by the reference's covariance. ``yaw`` and ``rigid`` are least squares of positions, as usual.
+    ``weight``: (N,), by the reference's covariance. ``yaw`` and ``rigid`` are least squares of positions, as usual; of a robot at rest
+    the orientations tell the rotation.
     """
     target, target_rotation = reference[:, :3, 3], reference[:, :3, :3]
     kept = usable.copy()
@@ -69,7 +73,11 @@ def align_frame(
             np.swapaxes(target_rotation[kept], 1, 2).reshape(-1, 3),
         )
     R, t = np.eye(3), np.zeros(3)
-    fixed = mean_rotation if align == "start" else None
+    fixed = mean_rotation if align == "start" or _is_at_rest(target[kept]) else None
+    if fixed is not None and level:
+        fixed = exp_so3(
+            np.array([0.0, 0.0, np.arctan2(fixed[1, 0] - fixed[0, 1], fixed[0, 0] + fixed[1, 1])])
+        )
     for _ in range(1 if align == "start" else 3):
         w = np.where(kept, weight, 0.0)
         w = w / w.sum()
@@ -92,6 +100,10 @@ def align_frame(
     by_position[:, :3] += shift @ by_position[:, 3:]
     by_rotation[:, :3] += shift @ by_rotation[:, 3:]
     return AlignedFrame(transform_from(R, t), kept, by_position, by_rotation, determined)
+
+
+def _is_at_rest(position_m: FloatArray) -> bool:
+    return float(np.sqrt(((position_m - position_m.mean(axis=0)) ** 2).sum(axis=1).mean())) < REST_SPREAD_M
 
 
 def _start(rows: Rows, own_m: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -130,14 +142,15 @@ def _gains(
     by_position, by_rotation = np.zeros((n, 6, 3)), np.zeros((n, 6, 3))
     by_position[:, :3] = w[:, None, None] * np.eye(3)
     determined = np.ones(6, dtype=np.bool_)
+    if level:
+        determined[3:5] = False
     if by_orientation:
-        by_rotation[:, 3:] = w[:, None, None] * np.eye(3)
+        by_rotation[:, 3:] = w[:, None, None] * np.diag(determined[3:].astype(np.float64))
         return by_position, by_rotation, determined
     arms = skew(aligned - w @ aligned)
     inertia = (w[:, None, None] * (np.swapaxes(arms, 1, 2) @ arms)).sum(axis=0)
     turning = w[:, None, None] * arms  # J^T = skew(arm)
     if level:
-        determined[3:5] = False
         if inertia[2, 2] > 0:
             by_position[:, 5] = turning[:, 2] / inertia[2, 2]
     else:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
+from tsgt.errors import GeometryError
 from tsgt.geometry import log_so3, rotate, rotation_from_quaternion
 
 if TYPE_CHECKING:
@@ -73,6 +74,14 @@ def estimate_motion(estimate: Estimate) -> EstimateMotion:
     return EstimateMotion(stamp_ns[before] + step_ns // 2, velocity, turn_rate)
 
 
+class OffsetSearchError(GeometryError):
+    """No time offset was found, or none that is alone; ``finding`` says what was found instead."""
+
+    def __init__(self, finding: str, remedy: str) -> None:
+        super().__init__(f"{finding}: {remedy}")
+        self.finding = finding
+
+
 def offset_by_correlation(
     trajectory: ReferenceTrajectory, motion: EstimateMotion, start_s: float, max_offset_s: float
 ) -> float:
@@ -80,7 +89,7 @@ def offset_by_correlation(
 
     Within ``max_offset_s`` of ``start_s``; this itself if both overlap for less than 10 s, or the robot stands. Norms need neither frame nor extrinsic.
     Masked normalised correlation (D. Padfield, 2012), so that gaps count as unknown; the best offset is the most likely one, as a
-    correlation over a short overlap is more often high by chance. Raises ValueError: the motion agrees nowhere, or elsewhere, too.
+    correlation over a short overlap is more often high by chance. Raises OffsetSearchError: the motion agrees nowhere, or elsewhere, too.
     """
     start_ns = round(start_s * 1e9)
     if len(motion.stamp_ns) < 2:
@@ -96,9 +105,9 @@ def offset_by_correlation(
     own_first_ns = max(int(motion.stamp_ns[0]) + start_ns, trajectory.start_ns - near_ns)
     own_last_ns = min(int(motion.stamp_ns[-1]) + start_ns, trajectory.end_ns + near_ns)
     if max(last_ns - first_ns, own_last_ns - own_first_ns) > MAX_GRID * step_ns:
-        raise ValueError(
-            f"the time offset cannot be searched over {(own_last_ns - own_first_ns) / 86_400e9:.0f} days: remove poses with times of "
-            "a wrong clock, or narrow the search with --max-offset-s"
+        raise OffsetSearchError(
+            f"the time offset cannot be searched over {(own_last_ns - own_first_ns) / 86_400e9:.0f} days",
+            "remove poses with times of a wrong clock, or narrow the search with --max-offset-s",
         )
     grid_ns = first_ns + np.arange((last_ns - first_ns) // step_ns + 1) * step_ns
     own_ns = own_first_ns + np.arange((own_last_ns - own_first_ns) // step_ns + 1) * step_ns
@@ -126,22 +135,22 @@ def offset_by_correlation(
     best, anywhere = int(np.argmax(inside)), int(np.argmax(likelihood))
     elsewhere = inside[best] < AMBIGUOUS_SHARE * likelihood[anywhere]
     if elsewhere and score[anywhere] >= CLEAR_CORRELATION:
-        raise ValueError(
+        raise OffsetSearchError(
             f"its motion agrees best with the reference's at a time offset of {offset_s[anywhere]:.1f} s (correlation "
-            f"{score[anywhere]:.2f}), more than the {max_offset_s:g} s that are searched: is it of the same drive? if so, search further "
-            "with --max-offset-s"
+            f"{score[anywhere]:.2f}), more than the {max_offset_s:g} s that are searched",
+            "is it of the same drive? if so, search further with --max-offset-s",
         )
     if elsewhere or score[best] < MIN_CORRELATION:
-        raise ValueError(
-            f"its motion agrees with the reference's at no time offset within {max_offset_s:g} s (correlation {score[best]:.2f}): is it "
-            "of the same drive? search further with --max-offset-s, or leave the offset out (--fit none)"
+        raise OffsetSearchError(
+            f"its motion agrees with the reference's at no time offset within {max_offset_s:g} s (correlation {score[best]:.2f})",
+            "is it of the same drive? search further with --max-offset-s, or leave the offset out (--fit none)",
         )
     other = _second_peak(inside, best)
     if other is not None:
-        raise ValueError(
+        raise OffsetSearchError(
             f"its motion agrees with the reference's about as well at a time offset of {offset_s[best]:.1f} s as at "
-            f"{offset_s[other]:.1f} s (correlations {score[best]:.2f}, {score[other]:.2f}): is it of the same drive? if so, narrow the "
-            "search with --max-offset-s"
+            f"{offset_s[other]:.1f} s (correlations {score[best]:.2f}, {score[other]:.2f})",
+            "is it of the same drive? if so, narrow the search with --max-offset-s, or leave the offset out (--fit none)",
         )
     return float(offset_s[best]) + GRID_S * _vertex(score[max(best - 1, 0) : best + 2])
 

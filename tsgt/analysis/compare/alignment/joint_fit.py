@@ -32,7 +32,7 @@ from tsgt.analysis.compare.alignment.initialisation import (
 )
 from tsgt.analysis.compare.alignment.noise import estimate_noise
 from tsgt.analysis.compare.alignment.reference_error import as_white, own_covariance, whiten
-from tsgt.analysis.compare.alignment.uncertainty import fit_covariance, weak_unknowns
+from tsgt.analysis.compare.alignment.uncertainty import fit_covariance, weak_unknowns, weakest_stated
 from tsgt.analysis.compare.pairing import on_reference_clock
 from tsgt.analysis.compare.relation import Relation
 from tsgt.geometry import exp_so3, log_so3, rotate
@@ -61,6 +61,7 @@ LOST_AT_FIRST = (
     1e12  # Squared distance given to such steps, so that the first step of the fit does without them
 )
 CONVERGED_SIGMAS = 1e-3
+MAX_TURNS, TURN_TOLERANCE_RAD = 50, 1e-9
 
 OUTLIER_SQUARE = 40.0  # Squared Mahalanobis distance of a pose
 LOST_SQUARE = 60.0  # Of a step of drift
@@ -123,14 +124,31 @@ def fit_jointly(
         noise = estimate_noise(trajectory, rows, unknowns, lost)
     unobservable = [i for i, name in enumerate(NAMES) if _never_observable(name, rows)]
     weak = weak_unknowns(solved, active, prior_terms) if solved is not None else []
-    if weak:
-        unobservable += weak
-        active = [i for i in active if i not in weak]
-        unknowns = _at_prior(unknowns, weak, begun, T_prior)
-    unknowns, solved = _iterate(
-        trajectory, rows, unknowns, noise, active, T_prior, prior_terms, tolerance_sigmas=CONVERGED_SIGMAS
-    )
-    covariance = fit_covariance(solved, rows)
+    while True:
+        first = None
+        if weak:
+            unobservable += weak
+            active = [i for i in active if i not in weak]
+            unknowns = _at_prior(unknowns, weak, begun, T_prior)
+            # The frame that the knots followed is not that of these values.
+            unknowns = start_states(trajectory, rows, unknowns, frame)
+            first = _moves_otherwise(rows, unknowns)
+        unknowns, solved = _iterate(
+            trajectory,
+            rows,
+            unknowns,
+            noise,
+            active,
+            T_prior,
+            prior_terms,
+            first,
+            tolerance_sigmas=CONVERGED_SIGMAS,
+        )
+        covariance = fit_covariance(solved, rows)
+        # The model may take the reference's noise for motion, which the residuals show.
+        weak = weakest_stated(covariance, active, prior_terms)
+        if not weak:
+            break
     every = _every_pose(trajectory, estimate, rows, unknowns, noise)
     names = tuple(NAMES[i] for i in sorted(unobservable))
     return JointFit(rows, unknowns, noise, active, covariance, names, every)
@@ -273,22 +291,31 @@ def _walk_variance(rows: Rows, unknowns: Unknowns, noise: Noise) -> FloatArray:
 
 
 def _at_prior(unknowns: Unknowns, weak: list[int], begun: Unknowns, T_prior: FloatArray) -> Unknowns:
+    """Return the unknowns with the weak ones as they were given, clock and scale as they were begun with."""
     names = {NAMES[i] for i in weak}
     arm_m = unknowns.arm_m.copy()
-    turned = log_so3(unknowns.R_point_sensor @ begun.R_point_sensor.T)
     for i in weak:
         if 3 <= i < 6:
             arm_m[i - 3] = T_prior[i - 3, 3]
-        elif i >= 6:
-            turned[i - 6] = 0.0
+    about = np.array([float(i in weak) for i in (6, 7, 8)])
     return replace(
         unknowns,
         offset_s=begun.offset_s if "offset_s" in names else unknowns.offset_s,
         skew=begun.skew if "skew" in names else unknowns.skew,
         scale=begun.scale if "scale" in names else unknowns.scale,
         arm_m=arm_m,
-        R_point_sensor=exp_so3(turned) @ begun.R_point_sensor,
+        R_point_sensor=_turned_towards(unknowns.R_point_sensor, T_prior[:3, :3], about),
     )
+
+
+def _turned_towards(rotation: FloatArray, target: FloatArray, about: FloatArray) -> FloatArray:
+    """Turn a rotation, (3, 3), about the fixed axes that are 1 in ``about``, (3,), to where it is closest to another one."""
+    for _ in range(MAX_TURNS):
+        rest = about * log_so3(rotation @ target.T)
+        if np.linalg.norm(rest) < TURN_TOLERANCE_RAD:
+            break
+        rotation = exp_so3(-rest) @ rotation
+    return rotation
 
 
 def _every_pose(

@@ -48,6 +48,13 @@ def weak_unknowns(solved: Solved, active: list[int], prior_weight: FloatArray) -
     return weak
 
 
+def weakest_stated(covariance: FloatArray, active: list[int], prior_weight: FloatArray) -> list[int]:
+    """Return the unknown without prior whose stated sigma is furthest above what is of any use; none if all are of use."""
+    limit = np.array([OBSERVABLE_SIGMA[NAMES[i]] for i in active])
+    excess = np.where(prior_weight[active] > 0, 0.0, np.diag(covariance) / np.maximum(limit**2, 1e-300))
+    return [active[int(np.argmax(excess))]] if excess.max(initial=0.0) > 1.0 else []
+
+
 def fit_covariance(solved: Solved, rows: Rows) -> FloatArray:
     """Covariance of the active unknowns, (P, P): that of the model, widened where the residuals' pull is correlated beyond it.
 

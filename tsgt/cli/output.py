@@ -62,6 +62,11 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     console.print(table)
 
 
+def percent(share: float) -> str:
+    """Return a share as text; "-" for NaN."""
+    return f"{share:.2%}" if share == share else "-"
+
+
 def numbers(*values: float, digits: int = 2) -> list[str]:
     """Return table cells; NaN becomes a dash."""
     return ["-" if math.isnan(value) else f"{value:.{digits}f}" for value in values]

@@ -164,7 +164,7 @@ def transforms_of(poses: PoseBatch, rows: NDArray[np.intp]) -> FloatArray:
     return transform_from(rotation_from_quaternion(poses.orientation_xyzw[rows]), poses.position_m[rows])
 
 
-MIN_POSES = 20  # One second at 20 Hz: intervals with fewer poses are ignored
+MIN_STOP_S = 1.0  # Of poses with a reference: shorter intervals are ignored
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,15 +217,16 @@ def stationary_errors(
     """Compare the mean pose of each stationary interval with the mean of the reference at the same instants, unaligned.
 
     Invalid poses are ignored; ``stationary_ns``: start and end in Unix ns; ``centroid_m``: as for :func:`compare`.
-    One entry per interval with at least :data:`MIN_POSES` poses that have a reference.
+    One entry per interval with poses that have a reference for at least :data:`MIN_STOP_S`.
     """
+    period_s = float(np.median(np.diff(poses.stamp_ns))) / 1e9 if len(poses) > 1 else 0.0
     reference = reference.of_point(poses.reference_point)
     position_m, at_centroid_m, rotation_rad = [], [], []
     for start_ns, end_ns in stationary_ns:
         rows = np.flatnonzero(poses.valid & (poses.stamp_ns >= start_ns) & (poses.stamp_ns <= end_ns))
         true, known = reference.at(poses.stamp_ns[rows])
         rows, true = rows[known], true[known]
-        if len(rows) < MIN_POSES:
+        if not len(rows) or round(len(rows) * period_s, 6) < MIN_STOP_S:
             continue
         rotation = rotation_from_quaternion(poses.orientation_xyzw[rows])
         estimated = transform_from(rotation, poses.position_m[rows])

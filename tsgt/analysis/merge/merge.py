@@ -21,7 +21,7 @@ from tsgt.recording import MergedRecord, RecordingWriter, encode_line, read_line
 from tsgt.recording.journal import is_unfinished_journal, load_journal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.analysis.merge.matching import JournalMeasurement, Match
@@ -153,7 +153,7 @@ def _additions(
         for index, entry in enumerate(boot.entries):
             time = _classify(index, entry, matches, known, results[entry.source.number])
             if time is not None:
-                record = _record(entry, time, paths[entry.source.number])
+                record = _record(entry, time, paths[entry.source.number], recorded.stations)
                 additions.append(_Addition(time.unix_ns, len(additions), record))
     if results and all(result.skipped for result in results):
         raise RecordingError(
@@ -231,12 +231,17 @@ def _classify(
     return best
 
 
-def _record(entry: JournalMeasurement, time: MasterTime, path: Path) -> MergedRecord:
+def _record(
+    entry: JournalMeasurement, time: MasterTime, path: Path, prisms: Mapping[int, int]
+) -> MergedRecord:
+    """``prisms``: of the stations, which classic does not transmit: what was delivered has the one that the master's configuration names."""
+    classic = entry.source.journal.head.stream_id is None
     # Processing adds the instrument's usual time sigma to every measurement: record only the excess.
     usual_ns = 1e9 * instrument_time_sigma_s(entry.measurement.sequence)
     excess_ns = math.sqrt(max(entry.measurement.stamp_sigma_ns**2 - usual_ns**2, 0.0))
     measurement: PolarMeasurement = dataclasses.replace(
         entry.measurement,
+        prism=prisms[entry.measurement.station] if classic else entry.measurement.prism,
         stamp_ns=time.unix_ns,
         stamp_sigma_ns=round(math.hypot(time.sigma_ns, excess_ns)),
         stamp_bound_ns=time.bound_ns,

@@ -36,9 +36,12 @@ class Session:
 
 @dataclass(slots=True)
 class RecordingIndex:
-    """Numbers of all stations in the parameters, sessions of the master, and identities of measurements merged before."""
+    """Prisms of all stations in the parameters, sessions of the master, and identities of measurements merged before.
 
-    stations: set[int] = field(default_factory=set)
+    ``stations``: prism by the number of the station, of the last parameters that have it.
+    """
+
+    stations: dict[int, int] = field(default_factory=dict)
     sessions: list[Session] = field(default_factory=list)
     merged: set[Identity] = field(default_factory=set)
 
@@ -98,7 +101,7 @@ def _add(line: Line, index: RecordingIndex, path: Path) -> None:
     known_ns = session.end_ns
     match line.type:
         case "parameters":
-            index.stations |= {s.station for s in decode_line(Parameters, line, path).stations}
+            index.stations |= {s.station: s.prism for s in decode_line(Parameters, line, path).stations}
         case "measurement":
             measurement = decode_line(PolarMeasurement, line, path)
             session.delivered[measurement.station].append(measurement)

@@ -233,8 +233,14 @@ def _computed(
 def _recorded_poses(
     path: Path, series: str | None, *, keep_going: bool, quiet: bool, reported: bool
 ) -> Generator[tuple[ReferencePoint, PoseRecord], None, None]:
-    """Yield the poses of a series (default: interpolated and final ones), each with its point."""
+    """Yield the poses of a series (default: interpolated and final ones), each with its point.
+
+    Those before a set-up that was replaced while the master ran are left out: the tripods may have stood elsewhere. Raises
+    RecordingError: runs that were joined overlap.
+    """
     point = ROBOT_ORIGIN
+    replaced_line, left_out = _replaced_line(path), 0
+    last: PoseRecord | None = None
     on_problem = None if reported else report_problem
     done_bytes = 0
     with nullcontext() if quiet else progress("exporting") as on_progress:
@@ -254,7 +260,32 @@ def _recorded_poses(
                     raise
                 report_problem(problem)
             else:
-                if pose.series in (_FINAL if series is None else (series,)):
-                    yield point, pose
+                if pose.series not in (_FINAL if series is None else (series,)):
+                    continue
+                if line.number < replaced_line:
+                    left_out += 1
+                    continue
+                if last is not None and pose.stamp_ns <= last.stamp_ns:
+                    raise RecordingError(
+                        f"line {line.number}: its time is not later than that of the pose before: runs that were joined overlap; export each "
+                        "by itself",
+                        path=path,
+                    )
+                last = pose
+                yield point, pose
         if on_progress is not None:
             on_progress(1.0)
+    if left_out:
+        click.echo(f"note: {path}: {left_out} poses before the set-up was replaced are left out", err=True)
+
+
+def _replaced_line(path: Path) -> int:
+    """Return the number of the last line with parameters that replace others while the master runs; 0: there is none."""
+    found, begins = 0, False
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if line.startswith(b'{"type":"parameters"'):
+                found, begins = found if begins else number, False
+            elif line.startswith(b'{"type":"recording"'):
+                begins = True
+    return found

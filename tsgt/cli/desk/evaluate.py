@@ -35,7 +35,7 @@ from tsgt.cli.options import (
     recording_argument,
     reference_point_option,
 )
-from tsgt.cli.output import numbers, print_json, print_table, require_extra
+from tsgt.cli.output import numbers, percent, print_json, print_table, require_extra
 from tsgt.cli.progress import TUNING, progress
 from tsgt.cli.recordings import (
     duration_s,
@@ -376,7 +376,7 @@ def _print_pairs(pairs: Sequence[PairDistances]) -> None:
 def _print_residuals(residuals: dict[int, dict[str, ResidualStatistics]]) -> None:
     click.echo("\nNormalised residuals of the continuous trajectory")
     rows = [
-        [f"{station} {axis.replace('_', ' ')}", str(f.n), *numbers(f.mean, f.std), f"{f.beyond_3_sigma:.2%}"]
+        [f"{station} {axis.replace('_', ' ')}", str(f.n), *numbers(f.mean, f.std), percent(f.beyond_3_sigma)]
         for station, axes in residuals.items()
         for axis, f in axes.items()
     ]

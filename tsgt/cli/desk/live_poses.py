@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.cli.output import numbers, print_table
+from tsgt.cli.output import numbers, percent, print_table
 from tsgt.estimation import point_label
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ def print_live(found: LiveComparison, parameters: Parameters) -> None:
                     errors.position_rms_mm, errors.position_p95_mm, errors.centroid.position_rms_mm, digits=1
                 ),
                 *numbers(errors.orientation_rms_deg, errors.nees.mean),
-                *map(_percent, (errors.beyond_limits.position, errors.beyond_limits.rotation)),
-                *map(_percent, (errors.beyond_3_sigma.position, errors.beyond_3_sigma.rotation)),
+                *map(percent, (errors.beyond_limits.position, errors.beyond_limits.rotation)),
+                *map(percent, (errors.beyond_3_sigma.position, errors.beyond_3_sigma.rotation)),
             ]
         )
     print_table(
@@ -67,7 +67,3 @@ def print_live(found: LiveComparison, parameters: Parameters) -> None:
     ]
     of_point = [f"{point} {figure} mm" for figure in ("rms", "median", "p95")]
     print_table(["kind", "age ms", "n", *of_point, "rms deg", "NEES (6)"], rows)
-
-
-def _percent(share: float) -> str:
-    return f"{share:.2%}" if share == share else "-"

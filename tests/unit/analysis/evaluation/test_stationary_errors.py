@@ -14,9 +14,9 @@ SECOND_NS = 1_000_000_000
 CENTROID_M = np.array([0.2, 0.0, 1.0])
 
 
-def stationary_robot(count: int = 401) -> tuple[PoseBatch, Reference]:
+def stationary_robot(count: int = 401, period_ns: int = 50_000_000) -> tuple[PoseBatch, Reference]:
     """Return twenty seconds at 20 Hz at one place, without errors."""
-    stamps = START_NS + np.arange(count, dtype=np.int64) * 50_000_000
+    stamps = START_NS + np.arange(count, dtype=np.int64) * period_ns
     batch = PoseBatch.blank(stamps, (1, 2, 3), Kind.SMOOTHED)
     batch.position_m[:] = (5.0, -3.0, 0.5)
     batch.orientation_xyzw[:] = Rotation.from_euler("z", 0.4).as_quat()
@@ -53,6 +53,16 @@ def test_only_instants_with_valid_poses_are_compared() -> None:
     poses.reason[200:] = Reason.OUTAGE
     found = stationary_errors(poses, truth, [(START_NS, START_NS + 20 * SECOND_NS)], CENTROID_M)
     np.testing.assert_allclose(found.position_m, [0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("rate_hz", [5, 20, 100])
+def test_a_second_of_poses_counts_at_any_rate(rate_hz: int) -> None:
+    """Whatever the number of poses in it."""
+    poses, truth = stationary_robot(4 * rate_hz, SECOND_NS // rate_hz)
+    last_ns = SECOND_NS - SECOND_NS // rate_hz
+    for until_ns, stops in ((last_ns, 1), (last_ns - SECOND_NS // rate_hz, 0)):
+        found = stationary_errors(poses, truth, [(START_NS, START_NS + until_ns)], CENTROID_M)
+        assert len(found.position_m) == stops
 
 
 def test_intervals_with_less_than_a_second_of_poses_are_ignored() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -122,6 +123,20 @@ def test_every_measurement_is_present_once(outage: MissionResult, tmp_path: Path
     assert max(measured(path).values()) == 1
     assert merged.added + merged.already_there == sum(journal.measurements for journal in merged.journals)
     assert merged.bounds_ns[-1] < 5_000_000
+
+
+def test_merged_measurements_have_the_prism_that_the_master_names(
+    outage: MissionResult, tmp_path: Path
+) -> None:
+    """Classic does not transmit the one of the client's configuration, which may differ."""
+    path = recording(outage, tmp_path / "r.jsonl")
+    renumbered = []
+    for number, journal in enumerate(journals(outage)):
+        renumbered.append(tmp_path / f"{number}.jsonl")
+        renumbered[-1].write_bytes(re.sub(rb'"prism":\d+', b'"prism":9', journal.read_bytes()))
+    assert merge(path, renumbered).added > 0
+    tracked = {(each.station, each.prism) for each in load_recording(path).measurements}
+    assert tracked == {(each.station, each.prism) for each in outage.parameters.stations}
 
 
 def test_second_merge_adds_nothing(outage: MissionResult, tmp_path: Path) -> None:

@@ -151,7 +151,11 @@ def test_invalid_poses_have_no_message(tsgt: Tsgt, tmp_path: Path) -> None:
     """A ROS message has no validity."""
     path, output = tmp_path / "poses.jsonl", tmp_path / "out.mcap"
     path.write_bytes(
-        recording_bytes(POSE, NO_POSE, dataclasses.replace(POSE, valid=False, reason="residual"))
+        recording_bytes(
+            POSE,
+            NO_POSE,
+            dataclasses.replace(POSE, stamp_ns=NO_POSE.stamp_ns + PERIOD_NS, valid=False, reason="residual"),
+        )
     )
     assert tsgt("export", path, "--format", "mcap", "--output", output).code == 0
     assert len(read(output)["/tsgt/pose"]) == 1
@@ -294,3 +298,25 @@ def test_frames_of_an_mcap_file_hang_on_the_point(tsgt: Tsgt, two_points: Path, 
     # Half a turn about x: what is up for the robot is down for the sensor.
     assert robot.transform.translation.z == pytest.approx(2.0)
     assert abs(robot.transform.rotation.x) == pytest.approx(1.0)
+
+
+def test_poses_before_a_set_up_that_was_replaced_are_left_out(tsgt: Tsgt, tmp_path: Path) -> None:
+    """The tripods may have stood elsewhere, so that their frame is another one; a note counts them."""
+    poses = [pose(k, "smoothed", float(k)) for k in range(5)]
+    path = tmp_path / "reload.jsonl"
+    path.write_bytes(
+        recording_bytes(*poses[:3]) + b"".join(encode_line(r) + b"\n" for r in (PARAMETERS, *poses[3:]))
+    )
+    outcome = tsgt("export", path, "--format", "tum")
+    assert xs(outcome) == [3.0, 4.0]
+    assert "3 poses before the set-up was replaced are left out" in outcome.err
+
+
+def test_joined_runs_that_overlap_are_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
+    """No reader of trajectories takes times that run backwards."""
+    path = tmp_path / "twice.jsonl"
+    path.write_bytes(2 * recording_bytes(*(pose(k, "smoothed", float(k)) for k in range(3))))
+    outcome = tsgt("export", path, "--format", "tum", "--output", tmp_path / "out.tum")
+    assert outcome.code == 1
+    assert "runs that were joined overlap; export each by itself" in outcome.err
+    assert not (tmp_path / "out.tum").exists()

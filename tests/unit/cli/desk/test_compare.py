@@ -170,7 +170,9 @@ def test_offset_of_relative_times_is_not_written(
     """It would say nothing of another drive, and no file could hold it."""
     relative, written = tmp_path / "relative.tum", tmp_path / "relative.toml"
     lines = [line.split() for line in lidar.read_text().splitlines()]
-    relative.write_text("".join(f"{float(time) - START_S + 1.0:.9f} {' '.join(rest)}\n" for time, *rest in lines))
+    relative.write_text(
+        "".join(f"{float(time) - START_S + 1.0:.9f} {' '.join(rest)}\n" for time, *rest in lines)
+    )
     options = ("--fit", "offset,extrinsic", "--output", written)
     assert tsgt("compare", reference, relative, *options).code == 0
     assert "offset_ms" not in written.read_text()

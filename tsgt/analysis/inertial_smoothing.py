@@ -94,7 +94,7 @@ class ImuUse:
     unused: tuple[UnusedInterval, ...]
     displaced_from_s: float = np.inf  # With fewer than three prisms: when a knock may have displaced it
     moved_from_s: float = np.inf  # When a tripod or prism seems to have moved
-    shaken_from_s: float = np.inf  # First shock: what contradicts it from then on is no sign of a move
+    first_shock_s: float = np.inf  # What contradicts it from then on is no sign of a move
     complete: bool = False  # Three prisms have poses without it, which are degraded where they contradict it, and else invalid
     odometry_samples: int = 0  # Of the wheel odometry that was used with it
 
@@ -109,7 +109,7 @@ class ImuUse:
         """(N,) whether it, a tripod or a prism may have moved at times, by measurements that contradict it without a shock."""
         found: NDArray[np.bool_] = time_s > self.moved_from_s
         for each in self.unused:
-            if each.reason == "contradiction" and each.start_s < self.shaken_from_s:
+            if each.reason == "contradiction" and each.end_s < self.first_shock_s:
                 found |= (time_s >= each.start_s) & (time_s <= each.end_s)
         return found
 
@@ -204,7 +204,7 @@ def fit_with_imu(
         ]
     _check_biases(found, imu.noise)
     shocks_s, moved_s = shock_times_s(recorded), first_move_s(found)
-    shaken_s = float(shocks_s.min(initial=np.inf))
+    first_shock_s = float(shocks_s.min(initial=np.inf))
     complete = not few_prisms and np.isinf(first_untold_s(observations, moved_s))
     if complete and ((shocks_s > moved_s - LONG_AFTER_S) & (shocks_s < moved_s + WINDOW_S)).any():
         moved_s = np.inf  # The IMU was knocked
@@ -216,9 +216,9 @@ def fit_with_imu(
         noise_scales,
         overall_scale(observations, noise_scales),
         (*missing, *contradicted, *unproven_intervals(found)),
-        first_untold_s(observations, min(shaken_s, first_unwatched_s(recorded, start_s))),
+        first_untold_s(observations, min(first_shock_s, first_unwatched_s(recorded, start_s))),
         moved_s,
-        shaken_s,
+        first_shock_s,
         complete,
         0 if wheels is None else len(wheels[0]),
     )

@@ -63,6 +63,17 @@ def shocked(recording: Recording, at_s: float) -> Recording:
     return replace(recording, imu_samples=samples)
 
 
+def sunk(recording: Recording, at_s: float) -> Recording:
+    """Return the recording with the tripod of station 1 30 mm lower from a time on."""
+    measurements = [
+        moved_measurement(each, [0.0, 0.0, -0.03])
+        if each.station == 1 and each.stamp_ns > START + at_s * 1e9
+        else each
+        for each in recording.measurements
+    ]
+    return replace(recording, measurements=measurements)
+
+
 def position_errors_m(found: SmoothedRecording) -> FloatArray:
     """Errors of the robot's origin at valid poses, (N,)."""
     poses = found.poses.select(found.poses.valid)
@@ -285,20 +296,13 @@ def test_poses_of_three_stations_are_degraded_once_one_has_sunk(
     shock_s: float | None, *, degraded: bool
 ) -> None:
     """The triangle of the prisms stays what it was; the IMU tells, unless it was knocked itself."""
-    recording = imu_recording(shaken_drive(40.0))
-    measurements = [
-        moved_measurement(each, [0.0, 0.0, -0.03])
-        if each.station == 1 and each.stamp_ns > START + 24 * 10**9
-        else each
-        for each in recording.measurements
-    ]
-    recording = replace(recording, measurements=measurements)
+    recording = sunk(imu_recording(shaken_drive(40.0)), 24.0)
     found = smooth(recording if shock_s is None else shocked(recording, shock_s))
     assert found.imu is not None
     disagrees = (found.poses.degraded & Degradation.IMU_DISAGREES) != 0
     after = found.poses.valid & (found.poses.stamp_ns > START + 24 * 10**9)
     assert after.sum() > 200
-    assert disagrees[after].all() == degraded
+    assert (disagrees[after] == degraded).all()
     assert not disagrees[found.poses.stamp_ns < START + 18 * 10**9].any()
 
 
@@ -308,14 +312,7 @@ def test_all_poses_are_degraded_where_the_set_up_is_right_in_a_part_of_the_drive
     shock_s: float | None, *, degraded: bool
 ) -> None:
     """Station 1 sinks in the middle, or the IMU was knocked there: it is left out."""
-    recording = imu_recording(shaken_drive(140.0))
-    measurements = [
-        moved_measurement(each, [0.0, 0.0, -0.03])
-        if each.station == 1 and each.stamp_ns > START + 70 * 10**9
-        else each
-        for each in recording.measurements
-    ]
-    recording = replace(recording, measurements=measurements)
+    recording = sunk(imu_recording(shaken_drive(140.0)), 70.0)
     found = smooth(recording if shock_s is None else shocked(recording, shock_s))
     assert found.imu is None
     assert ("in a part of the drive its set-up is right" in found.imu_problem) == degraded

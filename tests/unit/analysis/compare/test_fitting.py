@@ -52,6 +52,13 @@ def seen(time_s: FloatArray, relation: Relation, *, positions_only: bool = False
     )
 
 
+def carried(made: ReferencePoses, sensor: FloatArray) -> Estimate:
+    """Return an estimate without errors from poses of the sensor at the instants of the reference, (N, 4, 4), every other one."""
+    rows = slice(20, -20, 2)
+    orientation = quaternion_from_rotation(sensor[rows, :3, :3])
+    return Estimate("carried", made.stamp_ns[rows], sensor[rows, :3, 3], orientation, None)
+
+
 def difference(found: Relation, true: Relation) -> float:
     """Return the largest difference of two relations, in s, m, rad and 1."""
     T = invert(true.T_point_sensor) @ found.T_point_sensor
@@ -227,17 +234,7 @@ def test_vertical_lever_arm_is_unobservable_on_level_ground() -> None:
     level[:, :3, :3] = exp_so3(heading[:, None] * np.array([0.0, 0.0, 1.0]))
     flat = dataclasses.replace(made, T_station1_point=level)
     sensor = level @ EXTRINSIC
-    rows = slice(20, 780, 2)
-    estimate = noisy(
-        Estimate(
-            "flat",
-            made.stamp_ns[rows],
-            sensor[rows, :3, 3],
-            quaternion_from_rotation(sensor[rows, :3, :3]),
-            None,
-        ),
-        3,
-    )
+    estimate = noisy(carried(made, sensor), 3)
     found = fit(flat, estimate, FitSettings(EVERYTHING, "rigid"))
     assert found.unobservable == ("extrinsic_z_m",)
     assert found.relation.T_point_sensor[2, 3] == 0.0
@@ -282,17 +279,8 @@ def test_noise_of_the_reference_does_not_tell_the_height_on_level_ground(height_
     )
     extrinsic = EXTRINSIC.copy()
     extrinsic[2, 3] = height_m
-    sensor = (level @ extrinsic)[20:-20:2]
-    estimate = noisy(
-        Estimate(
-            "flat",
-            made.stamp_ns[20:-20:2],
-            sensor[:, :3, 3],
-            quaternion_from_rotation(sensor[:, :3, :3]),
-            None,
-        ),
-        5,
-    )
+    sensor = level @ extrinsic
+    estimate = noisy(carried(made, sensor), 5)
     jittering = transform_from(level[:, :3, :3] @ exp_so3(0.003 * rocking(n, 4)), level[:, :3, 3])
     found = fit(
         dataclasses.replace(made, T_station1_point=jittering), estimate, FitSettings(EVERYTHING, "rigid")
@@ -311,17 +299,8 @@ def test_rotation_about_a_straight_line_of_travel_is_left_as_given(seed: int) ->
         np.broadcast_to(exp_so3(np.array([0.0, 0.0, 0.3])), (len(way_m), 3, 3)),
         way_m[:, None] * np.array([np.cos(0.3), np.sin(0.3), 0.0]),
     )
-    sensor = straight[20:-20:2] @ transform_from(np.eye(3), EXTRINSIC[:3, 3])
-    estimate = noisy(
-        Estimate(
-            "seen",
-            made.stamp_ns[20:-20:2],
-            sensor[:, :3, 3],
-            quaternion_from_rotation(sensor[:, :3, :3]),
-            None,
-        ),
-        seed,
-    )
+    sensor = straight @ transform_from(np.eye(3), EXTRINSIC[:3, 3])
+    estimate = noisy(carried(made, sensor), seed)
     found = fit(
         dataclasses.replace(made, T_station1_point=straight), estimate, FitSettings(EVERYTHING, "rigid")
     )

@@ -32,7 +32,7 @@ from tsgt.analysis.compare.alignment.initialisation import (
 )
 from tsgt.analysis.compare.alignment.noise import estimate_noise
 from tsgt.analysis.compare.alignment.reference_error import as_white, own_covariance, whiten
-from tsgt.analysis.compare.alignment.uncertainty import fit_covariance, weak_unknowns, weakest_stated
+from tsgt.analysis.compare.alignment.uncertainty import fit_covariance, weak_unknowns, weakest_by_stated_sigma
 from tsgt.analysis.compare.pairing import on_reference_clock
 from tsgt.analysis.compare.relation import Relation
 from tsgt.geometry import exp_so3, log_so3, rotate
@@ -146,7 +146,7 @@ def fit_jointly(
         )
         covariance = fit_covariance(solved, rows)
         # The model may take the reference's noise for motion, which the residuals show.
-        weak = weakest_stated(covariance, active, prior_terms)
+        weak = weakest_by_stated_sigma(covariance, active, prior_terms)
         if not weak:
             break
     every = _every_pose(trajectory, estimate, rows, unknowns, noise)

@@ -48,7 +48,7 @@ def weak_unknowns(solved: Solved, active: list[int], prior_weight: FloatArray) -
     return weak
 
 
-def weakest_stated(covariance: FloatArray, active: list[int], prior_weight: FloatArray) -> list[int]:
+def weakest_by_stated_sigma(covariance: FloatArray, active: list[int], prior_weight: FloatArray) -> list[int]:
     """Return the unknown without prior whose stated sigma is furthest above what is of any use; none if all are of use."""
     limit = np.array([OBSERVABLE_SIGMA[NAMES[i]] for i in active])
     excess = np.where(prior_weight[active] > 0, 0.0, np.diag(covariance) / np.maximum(limit**2, 1e-300))

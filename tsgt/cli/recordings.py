@@ -199,10 +199,15 @@ def load(
 
 
 def calibrated(recording: Recording, path: Path) -> Recording:
-    """Return the recording, with a note if a part is left out; raises InputFileError if it has no calibration."""
+    """Return the recording, with a note if a part is left out or its runs differ; raises InputFileError if it has no calibration."""
     if recording.left_out:
         click.echo(
             f"note: {path}: {recording.left_out} measurements before the set-up was replaced are left out",
+            err=True,
+        )
+    if recording.set_ups_differ:
+        click.echo(
+            f"note: {path}: its runs were recorded with different set-ups; the last one is used for all of them",
             err=True,
         )
     if recording.parameters.no_poses is not None:

@@ -64,3 +64,11 @@ class Parameters:
     """The robot's wheel odometry, which is used with the IMU; absent where none is configured."""
     no_poses: str | None = None
     """Why no poses are computed: a set-up file is missing, so that frames or prisms are unknown here; else absent."""
+
+    def same_set_up(self, other: Parameters) -> bool:
+        """Whether the stations' frames and prisms, and the prisms' positions, are those of ``other``."""
+        return self._set_up() == other._set_up()
+
+    def _set_up(self) -> tuple[object, ...]:
+        stations = ((each.station, each.prism, each.T_station1_station) for each in self.stations)
+        return *stations, *self.prisms

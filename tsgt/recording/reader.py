@@ -57,6 +57,8 @@ class Recording:
     odometry: list[OdometrySamples] = field(default_factory=list)  # likewise
     left_out: int = 0
     """Measurements before the set-up was replaced while the master ran: the last parameters need not apply to them."""
+    set_ups_differ: bool = False
+    """Whether runs that were joined have other frames or prisms than the last, which is used for all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +143,7 @@ def load_recording(
     odometry: list[OdometrySamples] = []
     end_ns: int | None = None
     left_out = 0
-    replaced = new_session = False
+    replaced = new_session = set_ups_differ = False
     valid_from_ns = -(2**63)  # measurements before the last set-up arrive late or were merged
     for line in read_lines(path, imu=imu, poses=False, keep_going=keep_going, on_problem=on_problem):
         known_ns: int | None = None
@@ -151,7 +153,9 @@ def load_recording(
                     header = header or decode_line(RecordingHeader, line, path)
                     new_session = True
                 case "parameters":
-                    parameters = decode_line(Parameters, line, path)
+                    previous, parameters = parameters, decode_line(Parameters, line, path)
+                    differs = previous is not None and not parameters.same_set_up(previous)
+                    set_ups_differ = new_session and (set_ups_differ or differs)
                     replaced = not new_session and not whole
                     if replaced:
                         left_out += len(measurements)
@@ -193,6 +197,7 @@ def load_recording(
         imu_samples=imu_samples,
         odometry=odometry,
         left_out=left_out + len(early),
+        set_ups_differ=set_ups_differ,
     )
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -311,3 +312,14 @@ def test_file_of_zeros_is_named(tmp_path: Path) -> None:
     path.write_bytes(b"\0" * 4096)
     with pytest.raises(RecordingError, match="holds only zero bytes: a power cut"):
         load_recording(path)
+
+
+def test_joined_runs_may_have_different_set_ups(path: Path) -> None:
+    """The last one is used for all measurements, and the recording says so; of equal ones it does not."""
+    moved = replace(PARAMETERS, stations=PARAMETERS.stations[:2])
+    for second, differ in ((PARAMETERS, False), (moved, True)):
+        joined = b"".join(encode_line(record) + b"\n" for record in (HEADER, second, measurement(1)))
+        path.write_bytes(recording_bytes(measurement(0)) + joined)
+        recording = load_recording(path)
+        assert recording.measurements == [measurement(0), measurement(1)]
+        assert (recording.parameters, recording.set_ups_differ) == (second, differ)

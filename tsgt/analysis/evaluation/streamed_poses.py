@@ -57,14 +57,19 @@ def read_streamed_poses(
 ) -> dict[str, StreamedPoses]:
     """Read the poses of a recording by series, as those of a point of the robot; empty without poses.
 
-    ``keep_going``: skip lines that cannot be read instead of raising CorruptLineError; what
+    Those before a set-up that was replaced while the master ran are left out, as their measurements are. ``keep_going``: skip lines that cannot be read instead of raising CorruptLineError; what
     :func:`~tsgt.recording.read_lines` raises.
     """
-    reader = _Reader(point)
+    reader, new_session = _Reader(point), False
     for line in read_lines(path, keep_going=keep_going):
         try:
             match line.type:
+                case "recording":
+                    new_session = True
                 case "parameters":
+                    if not new_session:
+                        reader = _Reader(point)
+                    new_session = False
                     reader.start_session(decode_line(Parameters, line, path).reference_point)
                 case "measurement" | "point":
                     reader.now(decode_line(_Arrival, line, path).received_ns)

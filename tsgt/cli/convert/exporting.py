@@ -236,9 +236,10 @@ def _recorded_poses(
     """Yield the poses of a series (default: interpolated and final ones), each with its point.
 
     Those before a set-up that was replaced while the master ran are left out: the tripods may have stood elsewhere. Raises
-    RecordingError: runs that were joined overlap.
+    RecordingError: runs that were joined overlap, or have different set-ups.
     """
-    point = ROBOT_ORIGIN
+    parameters: Parameters | None = None  # of the run
+    set_up: Parameters | None = None  # of the last pose
     replaced_line, left_out = _replaced_line(path), 0
     last: PoseRecord | None = None
     on_problem = None if reported else report_problem
@@ -252,7 +253,7 @@ def _recorded_poses(
                 continue
             try:
                 if line.type == "parameters":
-                    point = decode_line(Parameters, line, path).reference_point
+                    parameters = decode_line(Parameters, line, path)
                     continue
                 pose = decode_line(PoseRecord, line, path)
             except CorruptLineError as problem:
@@ -271,8 +272,14 @@ def _recorded_poses(
                         "by itself",
                         path=path,
                     )
-                last = pose
-                yield point, pose
+                if set_up is not None and parameters is not None and not parameters.same_set_up(set_up):
+                    raise RecordingError(
+                        f"line {line.number}: its set-up is not that of the pose before: runs with different set-ups were joined; export each "
+                        "by itself",
+                        path=path,
+                    )
+                last, set_up = pose, parameters
+                yield ROBOT_ORIGIN if parameters is None else parameters.reference_point, pose
         if on_progress is not None:
             on_progress(1.0)
     if left_out:

@@ -145,3 +145,15 @@ def test_recording_without_poses_has_none(tmp_path: Path) -> None:
     lines: list[PoseRecord | object] = [HEADER, PARAMETERS, measurement(0)]
     (tmp_path / "r.jsonl").write_bytes(b"".join(encode_line(line) + b"\n" for line in lines))
     assert read_streamed_poses(tmp_path / "r.jsonl", ROBOT_ORIGIN) == {}
+
+
+def test_poses_before_a_replaced_set_up_are_left_out(tmp_path: Path) -> None:
+    """They are in other frames; those of a run that was joined are kept."""
+    path = tmp_path / "r.jsonl"
+    stream(path)
+    run = path.read_bytes()
+    replaced, joined = encode_line(PARAMETERS) + b"\n", b"".join(run.splitlines(keepends=True)[3:])
+    path.write_bytes(run + replaced + joined)
+    assert read_streamed_poses(path, ROBOT_ORIGIN)["predicted"].poses == 4
+    path.write_bytes(run + run)
+    assert read_streamed_poses(path, ROBOT_ORIGIN)["predicted"].poses == 8

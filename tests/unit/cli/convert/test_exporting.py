@@ -320,3 +320,15 @@ def test_joined_runs_that_overlap_are_an_error(tsgt: Tsgt, tmp_path: Path) -> No
     assert outcome.code == 1
     assert "runs that were joined overlap; export each by itself" in outcome.err
     assert not (tmp_path / "out.tum").exists()
+
+
+def test_joined_runs_with_different_set_ups_are_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Their poses are in different frames, which no file can say."""
+    path = tmp_path / "days.jsonl"
+    moved = dataclasses.replace(PARAMETERS, stations=PARAMETERS.stations[:2])
+    second = b"".join(encode_line(record) + b"\n" for record in (HEADER, moved, pose(5, "smoothed", 5.0)))
+    path.write_bytes(recording_bytes(pose(0, "smoothed", 0.0)) + second)
+    outcome = tsgt("export", path, "--format", "tum", "--output", tmp_path / "out.tum")
+    assert outcome.code == 1
+    assert "runs with different set-ups were joined; export each by itself" in outcome.err
+    assert not (tmp_path / "out.tum").exists()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from tsgt.errors import GeometryError
 from tsgt.estimation import (
+    SHOCK_INTERVAL_NS,
     UNWATCHED_NS,
     InertialSetupUncertainty,
     centroid_m,
@@ -94,7 +95,9 @@ class ImuUse:
     unused: tuple[UnusedInterval, ...]
     displaced_from_s: float = np.inf  # With fewer than three prisms: when a knock may have displaced it
     moved_from_s: float = np.inf  # When a tripod or prism seems to have moved
-    first_shock_s: float = np.inf  # What contradicts it from then on is no sign of a move
+    shocks_s: FloatArray = field(
+        default_factory=lambda: np.empty(0)
+    )  # (N,) samples of shocks, in their order
     complete: bool = False  # Three prisms have poses without it, which are degraded where they contradict it, and else invalid
     odometry_samples: int = 0  # Of the wheel odometry that was used with it
 
@@ -104,6 +107,16 @@ class ImuUse:
         for each in self.unused:
             found |= (time_s >= each.start_s) & (time_s <= each.end_s)
         return found
+
+    @property
+    def first_shock_s(self) -> float:
+        """When the first shock was; infinite without. What contradicts it from then on is no sign of a move."""
+        return float(self.shocks_s.min(initial=np.inf))
+
+    def shocks_before(self, time_s: FloatArray) -> NDArray[np.intp]:
+        """(N,) number of shocks before times."""
+        begins = np.diff(self.shocks_s, prepend=-np.inf) > SHOCK_INTERVAL_NS / 1e9
+        return np.searchsorted(self.shocks_s[begins], time_s)
 
     def disagrees_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """(N,) whether it, a tripod or a prism may have moved at times, by measurements that contradict it without a shock."""
@@ -218,7 +231,7 @@ def fit_with_imu(
         (*missing, *contradicted, *unproven_intervals(found)),
         first_untold_s(observations, min(first_shock_s, first_unwatched_s(recorded, start_s))),
         moved_s,
-        first_shock_s,
+        shocks_s,
         complete,
         0 if wheels is None else len(wheels[0]),
     )

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tsgt.estimation import (
-    UNCONFIRMED_SIGMAS,
     ContinuousPoseOutput,
     Degradation,
     MeasurementHistory,
     PoseBatch,
     Reason,
     measured_at_ns,
+    unconfirmed_covariance,
     usable,
 )
 from tsgt.geometry.trajectory import POSE_DIM
@@ -78,7 +78,7 @@ class PoseSeries:
             time_s = self._time_s(epochs_ns)
             states, covariance, common = imu.fit.trajectory.poses_at(time_s)
             displaced = time_s > imu.displaced_from_s
-            covariance[displaced] += np.diag(UNCONFIRMED_SIGMAS**2)
+            covariance[displaced] += unconfirmed_covariance(imu.shocks_before(time_s[displaced]))
             batch = self._output.smoothed(
                 epochs_ns, seen, states, covariance, common=common, converged=~imu.unused_at(time_s)
             )

@@ -8,7 +8,7 @@ hold and validate poses; `reference_point` carries them to another point of the 
 
 from tsgt.estimation.inertial import (
     MOVE_CAUSES,
-    UNCONFIRMED_SIGMAS,
+    SHOCK_INTERVAL_NS,
     UNWATCHED_NS,
     ImuSetupMonitor,
     OdometryState,
@@ -17,6 +17,7 @@ from tsgt.estimation.inertial import (
     check_recorded_setup,
     inertial_samples,
     start_now,
+    unconfirmed_covariance,
     wheel_samples,
 )
 from tsgt.estimation.linear import LinearEstimator
@@ -60,7 +61,7 @@ __all__ = [
     "MAX_DISTANCE_M",
     "MOVE_CAUSES",
     "POINT_COMMENT",
-    "UNCONFIRMED_SIGMAS",
+    "SHOCK_INTERVAL_NS",
     "UNWATCHED_NS",
     "ContinuousPoseOutput",
     "Degradation",
@@ -101,6 +102,7 @@ __all__ = [
     "transform_between",
     "transform_of",
     "uncertain_setup",
+    "unconfirmed_covariance",
     "usable",
     "wheel_samples",
     "with_noise_scales",

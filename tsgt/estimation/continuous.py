@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tsgt.estimation.inertial.selection import UNCONFIRMED_SIGMAS, ImuSelector
+from tsgt.estimation.inertial.selection import ImuSelector, unconfirmed_covariance
 from tsgt.estimation.noise_scales import noise_scales
 from tsgt.estimation.observations import build_observations, centroid_m
 from tsgt.estimation.pose_batch import Degradation, Kind, PoseBatch, Reason
@@ -315,8 +315,9 @@ class ContinuousEstimator:
 
     def _with_allowance(self, covariance: FloatArray) -> FloatArray:
         """Return the (N, 6, 6) covariance of poses, with what an unconfirmed set-up of the IMU may have wrong."""
-        unconfirmed = self._imu is not None and self._imu.unconfirmed
-        return covariance + np.diag(UNCONFIRMED_SIGMAS**2) if unconfirmed else covariance
+        if self._imu is None or not self._imu.unconfirmed:
+            return covariance
+        return covariance + unconfirmed_covariance(self._imu.shocks)
 
     def _smoothed_until(self, last_ns: int) -> PoseBatch:
         """Return the smoothed poses of the epochs up to an instant, and discard what only they needed."""

@@ -185,6 +185,19 @@ def test_poses_of_one_station_allow_for_a_shock_before_them(stations: int, *, di
     assert (sigmas[after].min() > np.radians(0.5)) == displaced
 
 
+def test_poses_allow_for_each_shock() -> None:
+    """Four knocks displace the IMU twice as far as one, on average; more are not allowed for."""
+    recording = imu_recording(DRIVE, stations=1)
+    once = smooth(shocked(recording, 10.0)).poses
+    for at_s in (10.0, 12.0, 14.0, 16.0, 18.0):
+        recording = shocked(recording, at_s)
+    found = smooth(recording).poses
+    for at_s, shocks in ((11.0, 1), (13.0, 2), (17.0, 4), (19.0, 4)):
+        row = np.searchsorted(found.stamp_ns, START + int(at_s * 1e9))
+        more = found.covariance[row, 5, 5] - once.covariance[row, 5, 5]
+        assert more == pytest.approx((shocks - 1) * np.radians(0.5) ** 2, abs=1e-5)
+
+
 def test_measurements_that_are_seconds_apart_are_not_doubted() -> None:
     """As those of a radio whose share of the air is limited."""
     recording = imu_recording(DRIVE, stations=1)

@@ -6,12 +6,13 @@ contradicted while the robot drives (`setup_monitor`), and the trajectory with o
 
 from tsgt.estimation.inertial.samples import SampleConverter, inertial_samples
 from tsgt.estimation.inertial.selection import (
-    UNCONFIRMED_SIGMAS,
     ImuState,
     OdometryState,
+    unconfirmed_covariance,
 )
 from tsgt.estimation.inertial.setup_monitor import (
     MOVE_CAUSES,
+    SHOCK_INTERVAL_NS,
     UNWATCHED_NS,
     ImuSetupMonitor,
     StartCheck,
@@ -22,7 +23,7 @@ from tsgt.estimation.inertial.wheels import wheel_samples
 
 __all__ = [
     "MOVE_CAUSES",
-    "UNCONFIRMED_SIGMAS",
+    "SHOCK_INTERVAL_NS",
     "UNWATCHED_NS",
     "ImuSetupMonitor",
     "ImuState",
@@ -32,5 +33,6 @@ __all__ = [
     "check_recorded_setup",
     "inertial_samples",
     "start_now",
+    "unconfirmed_covariance",
     "wheel_samples",
 ]

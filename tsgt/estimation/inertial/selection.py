@@ -23,6 +23,8 @@ from tsgt.model import MIN_PRISMS
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from numpy.typing import ArrayLike
+
     from tsgt.estimation.inertial.setup_monitor import ImuSetupMonitor
     from tsgt.geometry import FloatArray
     from tsgt.geometry.inertial import InertialFixedLagSmoother, WheelsEstimate
@@ -66,6 +68,9 @@ UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 """Of the position in m and the rotation in rad by what an unconfirmed set-up may have wrong: a mounting 1 deg off moves poses by
 0.35 deg rms, a lever arm 100 mm off or a latency 10 ms off by 2 mm and 0.2 deg (benchmarks/run.py imu_trust).
 """
+
+MAX_SHOCKS = 4
+"""Shocks whose displacements are allowed for. A robot on rough ground has many; a bracket that holds would lose its poses by more."""
 
 _SIMULTANEOUS_S = 0.01  # Measurements of one prism are further apart
 
@@ -347,6 +352,11 @@ class ImuSelector:
         return now_s - self._no_trajectory_from_s < (NO_TRAJECTORY_S if self._prisms >= MIN_PRISMS else 0.0)
 
     @property
+    def shocks(self) -> int:
+        """Number of shocks after which no drive has confirmed the set-up."""
+        return 0 if self._setup is None else self._setup.shocks
+
+    @property
     def unconfirmed(self) -> bool:
         """Whether poses rest on the IMU, though no drive has confirmed its set-up."""
         return self.use == ImuUse.USED and self._setup is not None and not self._setup.confirmed
@@ -392,6 +402,12 @@ class ImuSelector:
         for each in self._waiting:
             self._without.update(each)
         self._waiting.clear()
+
+
+def unconfirmed_covariance(shocks: ArrayLike) -> FloatArray:
+    """Return the covariance, (..., 6, 6), that a set-up adds to a pose which is not confirmed after numbers of shocks, (...)."""
+    counted = np.clip(shocks, 1, MAX_SHOCKS)
+    return np.asarray(counted[..., None, None] * np.diag(UNCONFIRMED_SIGMAS**2))
 
 
 def _nis(state: States, _: FloatArray, other: States, covariance: FloatArray) -> float:

@@ -49,6 +49,7 @@ FIRST_NS = 12_000_000_000  # Of measurements before the first check: fewer do no
 UNCONFIRMED_INTERVAL_NS = 4_000_000_000
 SILENT_NS = 1_000_000_000  # Without a record for this long the measurements' time bounds the records, too
 INTERVAL_NS = 20_000_000_000
+SHOCK_INTERVAL_NS = 1_000_000_000  # Samples of shocks that are closer are of one
 UNWATCHED_NS = 5_000_000_000  # Without samples for longer, a knock may have been missed: somebody may have plugged the IMU in again
 RESULT_NS, RESULT_FEW_NS = 2_000_000_000, 6_000_000_000
 """From the start of a check to its result, which the master waits for from then on. A slow computer takes a second; with fewer than three
@@ -184,6 +185,7 @@ class ImuSetupMonitor:
         self._result: Callable[[], SetupCheck] | None = None
         self._result_ns = 0
         self._watched_until_ns: int | None = None
+        self._shocks, self._shock_ns = 0, -SHOCK_INTERVAL_NS
         self._standing: dict[Cause, SetupFinding] = {}
         self._confirmed = self._was_confirmed = self._displaced = False
         self._open = tuple(_PARTS.values())
@@ -198,6 +200,11 @@ class ImuSetupMonitor:
     def was_confirmed(self) -> bool:
         """Whether the drive has confirmed the set-up, after the newest shock."""
         return self._was_confirmed
+
+    @property
+    def shocks(self) -> int:
+        """Number of shocks after which no drive has confirmed the set-up: each may have displaced the IMU."""
+        return self._shocks
 
     @property
     def may_have_moved(self) -> bool:
@@ -258,6 +265,9 @@ class ImuSetupMonitor:
             np.array(record.angular_rate_radps), np.array(record.specific_force_mps2)
         )
         if shocks.any():
+            shocks_ns = np.array(record.stamp_ns)[shocks]
+            self._shocks += abs(int(shocks_ns[0]) - self._shock_ns) > SHOCK_INTERVAL_NS
+            self._shock_ns = int(shocks_ns[-1])
             self._displaced |= few_prisms
             self._was_confirmed = False
         if shocks.any() or (few_prisms and unwatched):
@@ -289,6 +299,7 @@ class ImuSetupMonitor:
             self._confirmed = False
         elif not self._confirmed and check.confirmed and not self._displaced:
             self._confirmed = self._was_confirmed = True
+            self._shocks = 0
             self._next_ns = now_ns + INTERVAL_NS
             message = _CONFIRMATION_BY_PRISMS.get(len(self._parameters.prisms), _CONFIRMATION)
             self._events.append(EventRecord(stamp_ns=now_ns, event="imu_setup_confirmed", message=message))

@@ -468,10 +468,12 @@ def test_unconfirmed_imu_is_not_used_sooner_because_stations_had_none_long_ago(
     assert 0.1 + found[0][1] + found[1][1] == pytest.approx(NO_TRAJECTORY_S, abs=0.21)
 
 
+@pytest.mark.parametrize(("shocks", "counted"), [(0, 1), (1, 1), (3, 3), (9, 4)])
 def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, shocks: int, counted: int
 ) -> None:
-    """In its covariance, and it is degraded."""
+    """In its covariance, more after several shocks, and it is degraded."""
+    monkeypatch.setattr(ImuSelector, "shocks", shocks)
     confirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
     monkeypatch.setattr(ImuSelector, "unconfirmed", True)
     unconfirmed = predicted(records(scene, arrivals(scene, 2.5)))[-1]
@@ -480,8 +482,8 @@ def test_pose_with_an_unconfirmed_imu_allows_for_a_wrong_setup(
     assert confirmed.covariance is not None
     assert unconfirmed.covariance is not None
     added = np.diag((np.array(unconfirmed.covariance) - np.array(confirmed.covariance)).reshape(6, 6))
-    assert np.sqrt(added[3:]) == pytest.approx(np.radians(0.5), rel=1e-3)
-    assert (np.sqrt(added[:3]) >= 0.0049).all()
+    assert added[3:] == pytest.approx(counted * np.radians(0.5) ** 2, rel=2e-3)
+    assert (added[:3] >= counted * 0.0049**2).all()
 
 
 def test_outage_of_all_prisms_with_an_unconfirmed_imu(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

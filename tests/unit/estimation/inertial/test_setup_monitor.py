@@ -149,6 +149,21 @@ def test_few_prisms_do_not_confirm_after_a_blow_before_them(prisms: int, *, conf
     assert monitored.monitor.confirmed == confirmed
 
 
+@pytest.mark.parametrize(("prisms", "shocks"), [(3, 0), (2, 3), (1, 3)])
+def test_shocks_are_counted_until_a_drive_confirms(prisms: int, shocks: int) -> None:
+    """Each may have displaced the IMU further; samples within a second are of one."""
+    monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
+    monitored.run(22)
+    for later_s in (0.0, 0.6, 1.2, 4.0, 8.0):
+        later_ns = monitored.seconds * SECOND + int(later_s * SECOND)
+        stamps = tuple(START + later_ns + 1_000_000 * k for k in range(len(monitored.samples.stamp_ns)))
+        monitored.monitor.samples(replace(shock(monitored.samples), stamp_ns=stamps, received_ns=stamps[-1]))
+    assert monitored.monitor.shocks == 3
+    monitored.seconds += 8
+    monitored.run(22)
+    assert monitored.monitor.shocks == shocks
+
+
 @pytest.mark.parametrize("prisms", [2, 1])
 def test_few_prisms_confirm_anew_after_a_disagreement(prisms: int) -> None:
     """Whatever made the samples disagree, it was no shock."""

@@ -153,6 +153,22 @@ async def test_slow_reader_gets_the_number_of_lost_lines(path: Path) -> None:
     assert records[at]["count"] == 190 - at > 100
 
 
+@pytest.mark.parametrize("turns", range(8))
+async def test_reader_that_connects_while_a_set_up_is_read_gets_it(path: Path, turns: int) -> None:
+    """Its greeting is not from before: at any turn of the event loop between connecting and being greeted."""
+    setup = b'{"type":"setup","stamp_ns":2}'
+    async with StreamServer(path, HELLO) as server:
+        server.publish(b'{"type":"setup","stamp_ns":1}')
+        with socket.socket(socket.AF_UNIX) as connected:
+            connected.setblocking(False)
+            connected.connect(str(path))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            server.publish(setup)
+            await settle()
+            assert connected.recv(1000).splitlines()[-1] == setup
+
+
 async def test_slow_reader_gets_a_lost_setup(path: Path) -> None:
     """The newest one, once, in its place behind the event; it does not count as lost, and those before it do."""
 

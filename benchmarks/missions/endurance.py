@@ -138,16 +138,19 @@ class Endurance:
                     self._subscribers.follow_page(),
                 )
             ]
+            ending = asyncio.create_task(self._end_daemons())
             try:
-                await self._end_daemons()
+                done, _ = await asyncio.wait([ending, *watching], return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()  # what watches ends by an error alone
                 for task in watching:
                     task.cancel()
                 queued = await self._drain(lines)
                 air_ended = air.returncode is not None
             finally:
-                for task in (*daemons, *watching):
+                for task in (ending, *daemons, *watching):
                     task.cancel()
-                await asyncio.wait([*daemons, *watching])
+                await asyncio.wait([ending, *daemons, *watching])
         return self._result(queued, air_ended=air_ended)
 
     # --- While it runs ----------------------------------------------------------------------------------------

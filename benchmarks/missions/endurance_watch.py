@@ -86,7 +86,7 @@ class Stream:
         match line["type"]:
             case "pose":
                 self.first_s = self.first_s or now_s
-                delay_s = line["delay_s"]
+                delay_s = line.get("delay_s")
                 series = line["kind"] if delay_s is None else f"{line['kind']}_{delay_s:g}s"
                 self.epochs_ns[series].append(line["stamp_ns"])
                 self.valid[series] += line["valid"]

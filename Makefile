@@ -71,7 +71,7 @@ ros2: .ros2/jazzy/.complete .ros2/kilted/.complete
 	tests/interop/ros2/make_environment.sh .ros2/$* $* $(PYTHON)
 
 docs: $(VENV)/.test
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Forty times the examples of `make test`, on two cores; what is not done after 15 minutes is given up.
 # A failing example is kept in .hypothesis: `pytest` with the name of its test shrinks and shows it.

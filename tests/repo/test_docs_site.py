@@ -19,8 +19,9 @@ LOADED = re.compile(
 @pytest.mark.slow
 def test_site_builds_strictly_and_needs_no_network(tmp_path: Path) -> None:
     """No broken link, no page outside the navigation, no script, style or picture from elsewhere."""
+    # Without --quiet, which hides warnings from --strict, too.
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,

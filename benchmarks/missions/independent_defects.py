@@ -128,7 +128,6 @@ DEFECTS = {
     "angular-velocity": Defect(
         "the angular velocity is in the frame of the poses: roll rate and pitch rate are mixed",
         d.change_batch(d.angular_velocity_in_world),
-        duration_s=30,
     ),
     "constant-twice": Defect("the prism constant is added twice: 10 mm", d.add_constant_twice, duration_s=30),
     "outage": Defect(

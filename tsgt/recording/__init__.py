@@ -18,7 +18,14 @@ from tsgt.recording.format import (
     encode_line,
 )
 from tsgt.recording.merged import MergedRecord
-from tsgt.recording.reader import Recording, load_recording, read_imu_samples, read_lines, read_odometry
+from tsgt.recording.reader import (
+    Recording,
+    load_recording,
+    read_imu_samples,
+    read_lines,
+    read_odometry,
+    replaced_line,
+)
 from tsgt.recording.setup_record import (
     SETUP_START,
     SetupGeofence,
@@ -88,6 +95,7 @@ __all__ = [
     "read_lines",
     "read_odometry",
     "read_target_checks",
+    "replaced_line",
     "sync_folder",
     "write_atomically",
     "write_target_checks",

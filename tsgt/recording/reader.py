@@ -201,6 +201,18 @@ def load_recording(
     )
 
 
+def replaced_line(path: Path) -> int:
+    """Return the number of the last line with parameters that replace others while the master runs; 0: there is none."""
+    found, begins = 0, False
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if line.startswith(b'{"type":"parameters"'):
+                found, begins = found if begins else number, False
+            elif line.startswith(b'{"type":"recording"'):
+                begins = True
+    return found
+
+
 def read_imu_samples(
     path: Path,
     *,

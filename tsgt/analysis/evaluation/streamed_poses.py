@@ -13,7 +13,7 @@ import numpy as np
 from tsgt.errors import CorruptLineError
 from tsgt.estimation import records_at
 from tsgt.model import Parameters
-from tsgt.recording import PoseRecord, decode_line, read_lines
+from tsgt.recording import PoseRecord, decode_line, read_lines, replaced_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,23 +57,18 @@ def read_streamed_poses(
 ) -> dict[str, StreamedPoses]:
     """Read the poses of a recording by series, as those of a point of the robot; empty without poses.
 
-    Those before a set-up that was replaced while the master ran are left out, as their measurements are. ``keep_going``: skip lines that cannot be read instead of raising CorruptLineError; what
-    :func:`~tsgt.recording.read_lines` raises.
+    Those before a set-up that was replaced while the master ran are left out, as their measurements are. ``keep_going``: skip lines
+    that cannot be read instead of raising CorruptLineError; what :func:`~tsgt.recording.read_lines` raises.
     """
-    reader, new_session = _Reader(point), False
+    reader, first_line = _Reader(point), replaced_line(path)
     for line in read_lines(path, keep_going=keep_going):
         try:
             match line.type:
-                case "recording":
-                    new_session = True
                 case "parameters":
-                    if not new_session:
-                        reader = _Reader(point)
-                    new_session = False
                     reader.start_session(decode_line(Parameters, line, path).reference_point)
                 case "measurement" | "point":
                     reader.now(decode_line(_Arrival, line, path).received_ns)
-                case "pose":
+                case "pose" if line.number >= first_line:
                     reader.pose(decode_line(PoseRecord, line, path))
         except CorruptLineError:
             if not keep_going:

@@ -28,7 +28,14 @@ from tsgt.cli.recordings import ImuOptions, imu_options, load, load_reference, w
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.estimation import records_at
 from tsgt.model import ROBOT_ORIGIN, Parameters, ReferencePoint
-from tsgt.recording import PoseRecord, decode_line, load_recording, read_lines, write_atomically
+from tsgt.recording import (
+    PoseRecord,
+    decode_line,
+    load_recording,
+    read_lines,
+    replaced_line,
+    write_atomically,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator
@@ -240,7 +247,7 @@ def _recorded_poses(
     """
     parameters: Parameters | None = None  # of the run
     set_up: Parameters | None = None  # of the last pose
-    replaced_line, left_out = _replaced_line(path), 0
+    first_line, left_out = replaced_line(path), 0
     last: PoseRecord | None = None
     on_problem = None if reported else report_problem
     done_bytes = 0
@@ -263,7 +270,7 @@ def _recorded_poses(
             else:
                 if pose.series not in (_FINAL if series is None else (series,)):
                     continue
-                if line.number < replaced_line:
+                if line.number < first_line:
                     left_out += 1
                     continue
                 if last is not None and pose.stamp_ns <= last.stamp_ns:
@@ -284,15 +291,3 @@ def _recorded_poses(
             on_progress(1.0)
     if left_out:
         click.echo(f"note: {path}: {left_out} poses before the set-up was replaced are left out", err=True)
-
-
-def _replaced_line(path: Path) -> int:
-    """Return the number of the last line with parameters that replace others while the master runs; 0: there is none."""
-    found, begins = 0, False
-    with path.open("rb") as file:
-        for number, line in enumerate(file, start=1):
-            if line.startswith(b'{"type":"parameters"'):
-                found, begins = found if begins else number, False
-            elif line.startswith(b'{"type":"recording"'):
-                begins = True
-    return found

@@ -70,7 +70,7 @@ UNCONFIRMED_SIGMAS = np.repeat([0.005, np.radians(0.5)], 3)
 """
 
 MAX_SHOCKS = 4
-"""Shocks whose displacements are allowed for. A robot on rough ground has many; a bracket that holds would lose its poses by more."""
+"""Number of shocks that are allowed for at most: on rough ground there are many, which a good bracket withstands."""
 
 _SIMULTANEOUS_S = 0.01  # Measurements of one prism are further apart
 
@@ -405,7 +405,7 @@ class ImuSelector:
 
 
 def unconfirmed_covariance(shocks: ArrayLike) -> FloatArray:
-    """Return the covariance, (..., 6, 6), that a set-up adds to a pose which is not confirmed after numbers of shocks, (...)."""
+    """Return what an unconfirmed set-up adds to the covariance of a pose, (..., 6, 6), by the number of shocks before it, (...)."""
     counted = np.clip(shocks, 1, MAX_SHOCKS)
     return np.asarray(counted[..., None, None] * np.diag(UNCONFIRMED_SIGMAS**2))
 

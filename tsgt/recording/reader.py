@@ -39,6 +39,9 @@ _IMU_START, _POSE_START = _LINE_START + b'"imu",', _LINE_START + b'"pose",'
 S = TypeVar("S", ImuSamples, OdometrySamples)
 _TAGS: dict[type, str] = {ImuSamples: "imu", OdometrySamples: "odometry"}
 
+SAME_MEASUREMENT_NS = 1_000_000_000
+"""Two masters give a measurement times that differ by less. Later, a robot at rest may give all of its values again."""
+
 _MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, "point": PointMeasurement}
 
 
@@ -48,7 +51,8 @@ class Recording:
 
     header: RecordingHeader  # of the first run of the master
     parameters: Parameters  # the last ones in the file
-    measurements: list[Measurement]  # in the order of arrival, with merged ones at their place in the file
+    measurements: list[Measurement]
+    """In the order of arrival, merged ones at their place in the file; one that several runs recorded only once."""
     end_ns: int | None
     """Latest arrival, status or event in the file, on the master's Unix clock in ns; None without any."""
     imu_samples: list[ImuSamples] = field(
@@ -139,6 +143,7 @@ def load_recording(
     header: RecordingHeader | None = None
     parameters: Parameters | None = None
     measurements: list[Measurement] = []
+    earlier_ns: dict[object, int] = {}  # stamps of the measurements of the runs before
     imu_samples: list[ImuSamples] = []
     odometry: list[OdometrySamples] = []
     end_ns: int | None = None
@@ -151,6 +156,7 @@ def load_recording(
             match line.type:
                 case "recording":
                     header = header or decode_line(RecordingHeader, line, path)
+                    earlier_ns.update((_identity(each), each.stamp_ns) for each in measurements)
                     new_session = True
                 case "parameters":
                     previous, parameters = parameters, decode_line(Parameters, line, path)
@@ -164,7 +170,9 @@ def load_recording(
                     new_session = False
                 case "measurement" | "point":
                     measurement: Measurement = decode_line(_MEASUREMENTS[line.type], line, path)
-                    measurements.append(measurement)
+                    before_ns = earlier_ns.get(_identity(measurement)) if earlier_ns else None
+                    if before_ns is None or abs(measurement.stamp_ns - before_ns) > SAME_MEASUREMENT_NS:
+                        measurements.append(measurement)
                     known_ns = measurement.received_ns
                 case "merged":
                     measurements.append(decode_line(MergedRecord, line, path).measurement)
@@ -198,6 +206,19 @@ def load_recording(
         odometry=odometry,
         left_out=left_out + len(early),
         set_ups_differ=set_ups_differ,
+    )
+
+
+def _identity(measurement: Measurement) -> object:
+    """Return what a measurement has in common in the recordings of all masters that received it, but for its time."""
+    if isinstance(measurement, PointMeasurement):
+        return measurement
+    return (
+        measurement.station,
+        measurement.sequence,
+        measurement.horizontal_angle_rad,
+        measurement.zenith_angle_rad,
+        measurement.slope_distance_m,
     )
 
 

@@ -323,3 +323,20 @@ def test_joined_runs_may_have_different_set_ups(path: Path) -> None:
         recording = load_recording(path)
         assert recording.measurements == [measurement(0), measurement(1)]
         assert (recording.parameters, recording.set_ups_differ) == (second, differ)
+
+
+def test_measurement_that_two_joined_runs_recorded_counts_once(path: Path) -> None:
+    """A master that is killed before it acknowledges one has recorded it; the next master receives and records it again."""
+    first = measurement(5)
+    again = replace(first, stamp_ns=first.stamp_ns + 3_000_000, received_ns=first.received_ns + 20 * SECOND)
+    others = [replace(again, station=2), replace(again, sequence=6), replace(again, zenith_angle_rad=1.4)]
+    much_later = replace(again, stamp_ns=first.stamp_ns + 60 * SECOND)
+    joined = [HEADER, PARAMETERS, again, *others, much_later]
+    path.write_bytes(recording_bytes(first) + b"".join(encode_line(record) + b"\n" for record in joined))
+    assert load_recording(path).measurements == [first, *others, much_later]
+
+
+def test_one_run_keeps_equal_measurements(path: Path) -> None:
+    """Nothing is left out of a file that is no join, whatever the master wrote."""
+    path.write_bytes(recording_bytes(measurement(5), measurement(5)))
+    assert load_recording(path).measurements == [measurement(5), measurement(5)]

@@ -164,8 +164,8 @@ def fit_with_imu(
     start_s, end_s = float(observations.time_s[0]), float(observations.time_s[-1])
     if not len(samples) or samples.end_s[-1] < start_s or samples.end_s[0] > end_s:
         raise GeometryError(
-            "the samples of the IMU do not overlap with the measurements in time; give those of this drive, or shift them with "
-            "tsgt import imu --offset-ms"
+            "the samples of the IMU do not overlap with the measurements in time; give those of this drive, or align their clock: "
+            "tsgt import imu --align"
         )
 
     wheels = None

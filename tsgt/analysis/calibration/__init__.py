@@ -1,11 +1,12 @@
 """Calibration from field files and recordings: station frames and prisms from targets, the whole set-up and the IMU from motion.
 
 Comes in: target and prism files, a recording, the state of a target collection. Goes out: frames, prism positions and
-latencies with residuals, a check whether a station has moved, the next target to measure. The solvers are in
+latencies with residuals, the clock of imported IMU samples, a check whether a station has moved, the next target to measure. The solvers are in
 ``tsgt.geometry``: ``target_calibration``, ``motion_calibration`` and ``inertial_calibration``.
 """
 
 from tsgt.analysis.calibration.imu import CalibratedImu, calibrate_recorded_imu
+from tsgt.analysis.calibration.imu_clock import AlignedClock, align_recorded_clock
 from tsgt.analysis.calibration.motion import CalibratedRecording, HeldOutComparison, calibrate_recording
 from tsgt.analysis.calibration.station_check import StationCheck, check_station
 from tsgt.analysis.calibration.target_collection import StationTarget, TargetCollection
@@ -22,6 +23,7 @@ from tsgt.analysis.calibration.targets import (
 )
 
 __all__ = [
+    "AlignedClock",
     "CalibratedImu",
     "CalibratedRecording",
     "Exclusion",
@@ -30,6 +32,7 @@ __all__ = [
     "StationTarget",
     "TargetCalibration",
     "TargetCollection",
+    "align_recorded_clock",
     "calibrate_recorded_imu",
     "calibrate_recording",
     "check_repeats",

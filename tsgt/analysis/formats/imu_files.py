@@ -11,7 +11,7 @@ from tsgt.errors import InputFileError
 from tsgt.model import ImuSamples
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from tsgt.model import Vector3
@@ -51,13 +51,18 @@ def _read(path: Path, topic: str | None) -> Iterable[FileSample]:
     return _table(path) if path.suffix == TABLE_SUFFIX else _bag(path, topic)
 
 
-def imu_records(samples: Sequence[FileSample], offset_ns: int) -> Iterator[ImuSamples]:
-    """Yield records without gaps in them; ``offset_ns`` is added to all times. The sequence counts missing samples."""
-    return (_record(run, offset_ns) for run in sample_runs(samples))
+def imu_records(
+    samples: Sequence[FileSample], to_master_ns: Callable[[int], int] = lambda stamp_ns: stamp_ns
+) -> Iterator[ImuSamples]:
+    """Yield records without gaps in them. The sequence counts missing samples.
+
+    ``to_master_ns``: takes a sample's time to the master's clock.
+    """
+    return (_record(run, to_master_ns) for run in sample_runs(samples))
 
 
-def _record(run: SampleRun[FileSample], offset_ns: int) -> ImuSamples:
-    stamps = tuple(sample.stamp_ns + offset_ns for sample in run.samples)
+def _record(run: SampleRun[FileSample], to_master_ns: Callable[[int], int]) -> ImuSamples:
+    stamps = tuple(to_master_ns(sample.stamp_ns) for sample in run.samples)
     return ImuSamples(
         sequence=run.sequence,
         received_ns=stamps[-1],

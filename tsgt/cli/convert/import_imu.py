@@ -5,14 +5,25 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from tsgt.cli.convert.cut_tables import note_cut_tables
 from tsgt.cli.convert.imported_samples import write_samples
 from tsgt.cli.options import RECORDING_SUFFIXES, FiniteRange, OutputFile, json_option, path_type
-from tsgt.cli.output import print_json, refuse_overwrite
+from tsgt.cli.output import print_json, refuse_overwrite, report_problem
+from tsgt.cli.progress import progress
+from tsgt.cli.recordings import calibrated
+from tsgt.config import IMU_NOISE
+from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+
+    from tsgt.analysis.calibration import AlignedClock
+    from tsgt.analysis.formats.imu_files import FileSample
+
+_NOISE = "consumer"  # Which class it is matters little to its clock
 
 
 @click.command("imu")
@@ -26,14 +37,30 @@ if TYPE_CHECKING:
     help="Added to all times: the master's clock less that of the computer that recorded the files.",
 )
 @click.option(
+    "--align",
+    "recording",
+    type=path_type,
+    metavar="RECORDING",
+    help="Find offset and drift of the files' clock from the motion of the robot in this recording of three stations, and remove "
+    "them with the delay of the stamps.",
+)
+@click.option(
     "--output",
     type=OutputFile(*RECORDING_SUFFIXES),
     required=True,
     help="File of IMU samples to write (.jsonl), beside a recording; replaced if it exists.",
 )
 @json_option
+@click.pass_context
 def import_imu(
-    *, files: tuple[Path, ...], topic: str | None, offset_ms: float, output: Path, as_json: bool
+    context: click.Context,
+    *,
+    files: tuple[Path, ...],
+    topic: str | None,
+    offset_ms: float,
+    recording: Path | None,
+    output: Path,
+    as_json: bool,
 ) -> None:
     """Import samples of the robot's IMU that another program recorded.
 
@@ -44,13 +71,47 @@ def import_imu(
     from tsgt.analysis.formats import imu_records, interval_ns, read_imu_files
     from tsgt.analysis.formats.imu_files import TABLE_SUFFIX
 
-    refuse_overwrite(files, output)
+    if recording is not None and context.get_parameter_source("offset_ms") is not ParameterSource.DEFAULT:
+        raise click.UsageError("--align finds the offset; omit --offset-ms")
+    refuse_overwrite([*files, recording], output)
     samples = read_imu_files(files, topic)
     note_cut_tables(path for path in files if path.suffix == TABLE_SUFFIX)
-    gaps = write_samples(output, "imu", files, imu_records(samples, round(offset_ms * 1e6)))
+    offset_ns = round(offset_ms * 1e6)
+    clock = None if recording is None else _aligned(recording, samples)
+    to_master_ns = (lambda stamp_ns: stamp_ns + offset_ns) if clock is None else clock.to_master_ns
+    gaps = write_samples(output, "imu", files, imu_records(samples, to_master_ns))
     rate_hz = 1e9 / interval_ns(samples)
     if as_json:
-        print_json({"samples": len(samples), "rate_hz": rate_hz, "gaps": gaps})
+        content = {"samples": len(samples), "rate_hz": rate_hz, "gaps": gaps}
+        print_json(content if clock is None else content | {"clock": _json(clock)})
         return
     duration_s = (samples[-1].stamp_ns - samples[0].stamp_ns) / 1e9
     click.echo(f"{output}: {len(samples)} samples over {duration_s:.1f} s, {rate_hz:.1f} Hz, {gaps} gaps")
+    if clock is not None:
+        found = _json(clock)
+        click.echo(
+            "clock of the files less the master's, with the delay of the stamps: "
+            "{offset_ms:.1f} ms (sigma {offset_sigma_ms:.1f}) and {drift_ppm:.1f} ppm ({drift_sigma_ppm:.1f}), "
+            "from {parts} parts of the drive that differ by {rms_ms:.1f} ms (rms)".format(**found)
+        )
+
+
+def _aligned(recording: Path, samples: Sequence[FileSample]) -> AlignedClock:
+    from tsgt.analysis.calibration import align_recorded_clock
+    from tsgt.analysis.formats import imu_records
+
+    loaded = calibrated(load_recording(recording, on_problem=report_problem), recording)
+    with progress("aligning the clock") as on_progress:
+        return align_recorded_clock(loaded, imu_records(samples), IMU_NOISE[_NOISE], on_progress=on_progress)
+
+
+def _json(clock: AlignedClock) -> dict[str, float]:
+    found = clock.alignment
+    return {
+        "offset_ms": 1e3 * found.offset_s,
+        "offset_sigma_ms": 1e3 * found.offset_sigma_s,
+        "drift_ppm": 1e6 * found.drift,
+        "drift_sigma_ppm": 1e6 * found.drift_sigma,
+        "parts": found.parts,
+        "rms_ms": 1e3 * found.rms_s,
+    }

@@ -110,7 +110,9 @@ def series_of_samples(samples: InertialSamples) -> Series:
     return _smoothed(start_s, grid_s, grid_s, rate, force, known)
 
 
-def align(robot: Series, imu: Series, *, min_overlap_s: float = MIN_OVERLAP_S) -> Alignment:
+def align(
+    robot: Series, imu: Series, *, min_overlap_s: float = MIN_OVERLAP_S, max_latency_s: float = MAX_LATENCY_S
+) -> Alignment:
     """Find mounting and latency.
 
     Raises GeometryError: the robot hardly turns, or both have too little in common. Raises UnrelatedRatesError: no latency explains the
@@ -120,13 +122,14 @@ def align(robot: Series, imu: Series, *, min_overlap_s: float = MIN_OVERLAP_S) -
         raise GeometryError(
             f"the robot hardly turns (rms below {np.degrees(MIN_TURNING_RADPS):.1f} deg/s): drive curves, slopes and bumps"
         )
-    lags, scores = _rate_scores(robot, imu, min_overlap_s)
+    lags, scores = _rate_scores(robot, imu, min_overlap_s, max_latency_s)
     best = int(np.argmax(scores))
     correlation = float(scores[best])
     turning = _turning(robot)
     if correlation < MIN_CORRELATION * turning / np.hypot(turning, RATE_SIGMA_RADPS):
         raise UnrelatedRatesError(
-            f"the angular rates of the IMU are not those of the robot at any latency within {MAX_LATENCY_S:g} s "
+            "the angular rates of the IMU are not those of the robot at any latency"
+            f"{f' within {max_latency_s:g} s' if np.isfinite(max_latency_s) else ''} "
             f"(correlation {correlation:.2f}): another recording's IMU, or damaged samples"
         )
     latency_s = imu.start_s - robot.start_s + float(lags[best]) * GRID_S
@@ -175,7 +178,9 @@ def nearest_rotation(products: FloatArray) -> FloatArray:
     return rotation
 
 
-def _rate_scores(robot: Series, imu: Series, min_overlap_s: float) -> tuple[NDArray[np.intp], FloatArray]:
+def _rate_scores(
+    robot: Series, imu: Series, min_overlap_s: float, max_latency_s: float
+) -> tuple[NDArray[np.intp], FloatArray]:
     """Shifts of the IMU's grid against the robot's, in steps, and the correlation of the rates, aligned, at each."""
     from scipy.fft import irfft, next_fast_len, rfft  # noqa: PLC0415 (programs without an IMU start without it)
 
@@ -199,7 +204,7 @@ def _rate_scores(robot: Series, imu: Series, min_overlap_s: float) -> tuple[NDAr
     square_a = correlated((a**2).sum(axis=1), theirs) - (sum_a**2).sum(axis=1) / count
     square_b = correlated(known, (b**2).sum(axis=1)) - (sum_b**2).sum(axis=1) / count
     latency_s = imu.start_s - robot.start_s + lags * GRID_S
-    allowed = (np.abs(latency_s) <= MAX_LATENCY_S) & (count * GRID_S >= min_overlap_s)
+    allowed = (np.abs(latency_s) <= max_latency_s) & (count * GRID_S >= min_overlap_s)
     if not allowed.any():
         raise GeometryError(
             f"samples of the IMU and measurements have less than {min_overlap_s:g} s in common"

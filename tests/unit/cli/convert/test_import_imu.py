@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from harness.files.cli import called
+from harness.files.records import START, measurement, recording_bytes
+from harness.inertial.imu_calibration import uncalibrated_drive, write_imu_recording
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -162,3 +164,66 @@ def test_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     outcome = called("import", "imu", tmp_path / "bag", "--output", tmp_path / "imu.jsonl")
     assert outcome.code == 1
     assert "pip install 'tsgt[mcap]'" in outcome.err
+
+
+@pytest.mark.slow
+def test_clock_of_another_computer_is_aligned_with_a_recording(tmp_path: Path) -> None:
+    """Offset and drift are found and removed; the device's own times stay in the file."""
+    drive = uncalibrated_drive(160.0, latency_s=0.0, seed=3)
+    write_imu_recording(tmp_path / "field.jsonl", drive)
+    times_ns = START + np.round(1e9 * drive.samples.end_s).astype(np.int64)
+    stamps_ns = times_ns + 3_600_000_000_000 + np.round(60e3 * drive.samples.end_s).astype(np.int64)
+    values = np.hstack([drive.samples.angular_rate_radps, drive.samples.specific_force_mps2]).tolist()
+    rows = (f"{stamp},{','.join(map(repr, row))}" for stamp, row in zip(stamps_ns, values, strict=True))
+    (tmp_path / "imu.csv").write_text("\n".join([COLUMNS, *rows]) + "\n")
+    output = tmp_path / "imu.jsonl"
+    arguments = (
+        "import",
+        "imu",
+        tmp_path / "imu.csv",
+        "--align",
+        tmp_path / "field.jsonl",
+        "--output",
+        output,
+    )
+    done = called(*arguments, "--json")
+    assert done.code == 0, done.err
+    clock = done.json()["clock"]
+    assert clock["offset_ms"] == pytest.approx(3_600_004.8, abs=4 * clock["offset_sigma_ms"])
+    assert clock["drift_ppm"] == pytest.approx(60.0, abs=4 * clock["drift_sigma_ppm"])
+    records = list(read_imu_samples(output))
+    aligned_ns = np.array([stamp for record in records for stamp in record.stamp_ns])
+    assert np.abs(aligned_ns - times_ns).max() < 2_500_000
+    assert [stamp for record in records for stamp in record.instrument_time_ns or ()] == stamps_ns.tolist()
+    assert "clock of the files less the master's" in called(*arguments).out
+
+
+def test_align_and_offset_exclude_each_other(tmp_path: Path) -> None:
+    """The offset is found, or given."""
+    table = write_table(tmp_path / "imu.csv")
+    arguments = ("--align", table, "--offset-ms", "0", "--output", tmp_path / "imu.jsonl")
+    outcome = called("import", "imu", table, *arguments)
+    assert outcome.code == 2
+    assert "--align finds the offset; omit --offset-ms" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (recording_bytes(), "the recording has no measurements"),
+        (
+            recording_bytes(measurement(0)),
+            "fewer than 3 prisms do not tell how the robot turns; give --offset-ms",
+        ),
+        (b"{}", "does not begin with the header of a recording"),
+    ],
+    ids=["empty", "one-prism", "other-file"],
+)
+def test_recording_that_tells_no_clock_is_one_line(tmp_path: Path, content: bytes, expected: str) -> None:
+    """Nothing is written."""
+    (tmp_path / "field.jsonl").write_bytes(content)
+    table, output = write_table(tmp_path / "imu.csv"), tmp_path / "imu.jsonl"
+    outcome = called("import", "imu", table, "--align", tmp_path / "field.jsonl", "--output", output)
+    assert outcome.code == 1
+    assert expected in outcome.err
+    assert not output.exists()

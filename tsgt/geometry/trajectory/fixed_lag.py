@@ -34,6 +34,7 @@ from tsgt.geometry.trajectory.measurement_factors import time_order
 from tsgt.geometry.trajectory.measurement_window import (
     COST_TOLERANCE,
     MAX_STEPS,
+    MIN_INITIAL_INLIER_SHARE,
     MeasurementWindow,
     is_below_step_tolerance,
     normalised_innovations,
@@ -55,6 +56,11 @@ if TYPE_CHECKING:
     from tsgt.model import MotionPrior
 
 MAX_INITIAL_ITERATIONS = 10  # Six at most if it converges; others are retried
+MAX_FAILED_SEARCHES, RETRY_S, BRIEF_ITERATIONS = 10, 1.0, 2
+"""After so many initialisations in succession that explain too few of the measurements, they are searched at this interval, and with so few
+iterations in between: a search takes as long as twenty updates, and with a station that was carried away all fail.
+"""
+
 MIN_MEASUREMENTS_PER_PRISM, MAX_GAP_S = 3, 1.25  # Determine the trajectory without earlier ones
 MAX_AGE_S = 1.0  # Prisms measured since then: errors of predictions are comparable
 PREDICTION_NOISE_SCALE = 2.0  # After minutes of steady motion a sudden manoeuvre may come
@@ -95,6 +101,7 @@ class FixedLagSmoother(MeasurementWindow):
         self._smoothed: Trajectory | None = None
         self._propagator: Propagator | None = None
         self._prediction_errors = PredictionErrorMonitor()
+        self._failed_searches, self._searched_s = 0, -np.inf
         self.revision = 0
 
     @property
@@ -271,7 +278,13 @@ class FixedLagSmoother(MeasurementWindow):
         self._anchor = diffuse_prior(guess.select(slice(0, 1)), self._prior)
         if self._common is not None:
             self._common.reset()
-        outliers = self._solve(guess, MAX_INITIAL_ITERATIONS)
+        newest_s = float(observations.time_s[-1])
+        brief = self._failed_searches >= MAX_FAILED_SEARCHES and newest_s < self._searched_s + RETRY_S
+        outliers = self._solve(guess, BRIEF_ITERATIONS if brief else MAX_INITIAL_ITERATIONS)
+        if not brief:
+            inconsistent = float(np.mean(outliers)) >= 1.0 - MIN_INITIAL_INLIER_SHARE
+            self._failed_searches = self._failed_searches + 1 if inconsistent else 0
+            self._searched_s = newest_s
         if self._converged:
             assert self._knots is not None  # noqa: S101 (converged)
             self._anchor = AnchorPrior(self._knots.select(slice(0, 1)), np.diag(_DIFFUSE_SIGMAS**-2.0))

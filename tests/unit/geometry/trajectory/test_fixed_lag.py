@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -13,15 +13,18 @@ from tsgt.geometry.trajectory import (
     FixedLagSmoother,
     Observations,
     Trajectory,
+    fixed_lag,
     initial_guess,
     knot_times,
     solve,
 )
+from tsgt.geometry.trajectory.fixed_lag import BRIEF_ITERATIONS, MAX_FAILED_SEARCHES, RETRY_S
 from tsgt.geometry.trajectory.innovation_monitor import AMBIGUITY_MARGIN_S
 from tsgt.model import MotionPrior
 
 if TYPE_CHECKING:
     from tsgt.geometry import FloatArray
+    from tsgt.geometry.trajectory.gauss_newton import Solution
 
 PRIOR = MotionPrior()
 LAG_S = 3.0
@@ -169,6 +172,30 @@ def test_reinitialised_after_an_outage(observations: Observations) -> None:
     expected, _ = batch(again).at(again.time_s[-1:])
     sigmas = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     assert np.abs(state.local_coordinates_about(expected) / sigmas).max() < 0.3
+
+
+def test_measurements_that_fit_no_robot_are_searched_once_a_second(
+    observations: Observations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Distances in another unit, or a station that was carried away: a search takes a tenth of a second, a dozen would come each second."""
+    searches: list[float] = []
+
+    def counting(measured: Observations, *args: Any, max_iterations: int, **kwargs: Any) -> Solution:
+        if max_iterations > BRIEF_ITERATIONS:
+            searches.append(float(measured.time_s[-1]))
+        return solve(measured, *args, max_iterations=max_iterations, **kwargs)
+
+    monkeypatch.setattr(fixed_lag, "solve", counting)
+    wrong = observations.time_s < 8.0
+    stretched = np.where((wrong & (observations.station == 1))[:, None], 1000.0, 1.0) * observations.points_m
+    window, regained_s = FixedLagSmoother(PRIOR), []
+    measured = replace(observations, points_m=stretched)
+    for row, now_s in enumerate(measured.time_s.tolist()):
+        window.update(measured.select(slice(row, row + 1)))
+        window.marginalise_before(now_s - LAG_S)
+        regained_s += [now_s] if window.converged else []
+    assert MAX_FAILED_SEARCHES <= sum(at_s < 8.0 for at_s in searches) <= MAX_FAILED_SEARCHES + 8.0 / RETRY_S
+    assert 8.0 < regained_s[0] < 8.0 + LAG_S + RETRY_S
 
 
 def test_single_prism_is_tracked_with_growing_covariance(observations: Observations) -> None:

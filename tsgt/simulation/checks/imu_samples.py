@@ -10,6 +10,7 @@ import numpy as np
 from tsgt.errors import RecordingError
 from tsgt.recording import read_imu_samples
 from tsgt.simulation.checks.liveness import RECOVERY_TIME_S
+from tsgt.simulation.checks.sample_events import missing_events
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -56,10 +57,11 @@ def imu_failures(result: MissionResult) -> Iterator[str]:
 
 
 def imu_status_failures(result: MissionResult) -> Iterator[str]:
-    """Yield what is wrong with what poses and status say of the use of the IMU, its jumps and its bias."""
+    """Yield what is wrong with what poses, status and events say: use of the IMU, its jumps, its bias, its silences."""
     if result.imu is None:
         return
     for master_log in result.master_logs:
+        yield from missing_events(master_log, result.imu.samples.arrival_s, "imu")
         if len(master_log.jumps_m) >= MIN_JUMPS and not any(master_log.jumps_m):
             yield f"none of {len(master_log.jumps_m)} jumps of predicted poses is above 0"
         statuses = [status.imu for status in master_log.statuses]

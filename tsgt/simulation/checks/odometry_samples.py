@@ -10,6 +10,7 @@ import numpy as np
 from tsgt.errors import RecordingError
 from tsgt.recording import read_odometry
 from tsgt.simulation.checks.liveness import RECOVERY_TIME_S
+from tsgt.simulation.checks.sample_events import missing_events
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,14 +28,6 @@ MIN_RECORDED_SHARE = 0.98
 
 LAST_LINE_S = 0.2
 """The last line of the program may be incomplete at the end."""
-
-LOSS_EVENT_S = 2.5
-"""A silence that lasts longer must be an event by then: the timeout is 1 s, 2 s after a start of the master, and looked at each quarter of
-a second.
-"""
-
-RECOVERY_EVENT_S = 5.0
-"""From the first sample after a silence to the event: the program is restarted in vain every 2 s, and its clock fitted anew."""
 
 _DECIMALS = 6
 
@@ -59,7 +52,7 @@ def odometry_failures(result: MissionResult) -> Iterator[str]:
                 f"stamp of the sample at {result.odometry.time_s[rows][worst]:.3f} s is off by {1e3 * error_s[worst]:.1f} ms, "
                 f"limit {1e3 * MAX_TIME_ERROR_S:g} ms"
             )
-        yield from _missing_events(log, result.odometry)
+        yield from missing_events(log, result.odometry.arrival_s, "odometry")
     if result.faults_end_s is not None:
         arrival_s = result.odometry.arrival_s
         expected = (arrival_s >= result.faults_end_s + RECOVERY_TIME_S) & (
@@ -95,23 +88,3 @@ def _recorded(log: MasterLog, samples: OdometrySamples) -> tuple[NDArray[np.intp
                     rows.append(row)
                     stamps_ns.append(stamp_ns)
     return np.array(rows, dtype=np.intp), np.array(stamps_ns, dtype=np.int64), problem
-
-
-def _missing_events(log: MasterLog, samples: OdometrySamples) -> Iterator[str]:
-    """Yield each silence, while the master ran, of whose begin or end it gave no event."""
-    statuses_s = [(status.stamp_ns - log.unix_at_zero_ns) / 1e9 for status in log.statuses]
-    if not statuses_s:
-        return
-    events = [((event.stamp_ns - log.unix_at_zero_ns) / 1e9, event.event) for event in log.events]
-    after = np.flatnonzero(np.diff(samples.arrival_s) > LOSS_EVENT_S)
-    for begin_s, end_s in zip(
-        samples.arrival_s[after].tolist(), samples.arrival_s[after + 1].tolist(), strict=True
-    ):
-        for name, from_s, until_s in (
-            ("odometry_lost", begin_s, begin_s + LOSS_EVENT_S),
-            ("odometry_recovered", end_s, end_s + RECOVERY_EVENT_S),
-        ):
-            # It knew the samples before.
-            ran = statuses_s[0] + 1.0 < begin_s and until_s < statuses_s[-1]
-            if ran and not any(from_s <= at_s <= until_s and event == name for at_s, event in events):
-                yield f"silence from {begin_s:.1f} to {end_s:.1f} s: no event {name} by {until_s:.1f} s"

@@ -21,14 +21,19 @@ STATUSES = 12
 )
 def test_stated_gyro_bias(error_radps: float, use: str, valid_poses: int, failures: int) -> None:
     """It is wrong if it is far from the true one while valid poses rest on the IMU; before, it need not be known."""
-    status = SimpleNamespace(imu=SimpleNamespace(use=use, gyro_bias_radps=(error_radps, 0.0, 0.0)))
+    status = SimpleNamespace(
+        stamp_ns=0, imu=SimpleNamespace(use=use, gyro_bias_radps=(error_radps, 0.0, 0.0))
+    )
     counts = [PublishedCounts(0, 10 * n, valid_poses * n) for n in range(1, STATUSES + 1)]
     log = SimpleNamespace(
         statuses=[status] * STATUSES,
         imu_uses_at_status=[use] * STATUSES,
         counts_at_status=[(each, each) for each in counts],
         jumps_m=array("d"),
+        events=[],
+        unix_at_zero_ns=0,
     )
     truth = SimpleNamespace(gyro_bias_radps=np.zeros((1, 3)))
-    result: Any = SimpleNamespace(master_logs=[log], imu=SimpleNamespace(truth=truth))
+    imu = SimpleNamespace(truth=truth, samples=SimpleNamespace(arrival_s=np.arange(0.0, 20.0, 0.025)))
+    result: Any = SimpleNamespace(master_logs=[log], imu=imu)
     assert len(list(imu_status_failures(result))) == failures

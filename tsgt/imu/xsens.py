@@ -34,6 +34,13 @@ _TICK_NS = 100_000  # of the sample time
 
 _MAX_DATA_BYTES = 2048
 
+_FULL_SCALES = (("A5G4", 450.0, 5.0), ("MTi-6", 2000.0, 10.0))
+"""Of what is in a product code: angular rate in deg/s and specific force in g (MTi User Manual MT0605P, MTi 600-series data sheet
+MT1603P). Those of other devices are not known here; the estimators notice saturation by repeated values.
+"""
+
+_STANDARD_GRAVITY_MPS2 = 9.80665
+
 _EVERY = 0xFFFF  # with every other output
 
 _ERRORS = {
@@ -95,14 +102,18 @@ class Xsens:
     def hello(self) -> HelloLine:
         """Return what the device has said about itself."""
         revision = self._identity.get(REQ_FIRMWARE, b"")
+        model = self._identity.get(REQ_PRODUCT_CODE, b"").decode("ascii", "replace").strip()
+        scales = next(((rate, force) for part, rate, force in _FULL_SCALES if part in model), None)
         return HelloLine(
             imu=FORMAT_VERSION,
             make="Xsens",
-            model=self._identity.get(REQ_PRODUCT_CODE, b"").decode("ascii", "replace").strip(),
+            model=model,
             serial_number=self._identity.get(REQ_DID, b"").hex().upper(),
             firmware=".".join(str(part) for part in revision[:3]),
             rate_hz=float(self._rate_hz),
             clock="sample time, 0.1 ms",
+            angular_rate_limit_radps=None if scales is None else math.radians(scales[0]),
+            specific_force_limit_mps2=None if scales is None else scales[1] * _STANDARD_GRAVITY_MPS2,
         )
 
     def _messages(self) -> Iterator[tuple[int, bytes]]:

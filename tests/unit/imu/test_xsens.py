@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -106,6 +107,23 @@ def test_device_is_set_up() -> None:
     assert (hello.model, hello.serial_number, hello.firmware) == ("MTi-300-2A5G4", "037003F8", "1.8.2")
     assert simulated.running
     assert simulated.rate_hz == 200.0
+
+
+@pytest.mark.parametrize(
+    ("code", "rate_dps", "force_g"),
+    [("MTi-300-2A5G4", 450.0, 5.0), ("MTi-630R-8A1G6", 2000.0, 10.0), ("MTi-3-8A7G6T", None, None)],
+)
+def test_full_scale_follows_from_the_product_code(
+    code: str, rate_dps: float | None, force_g: float | None
+) -> None:
+    """So that saturated samples are counted; of a device that is not known it is not guessed."""
+    device = Xsens(200)
+    device.push(message(0x1D, code.ljust(20).encode()))
+    hello = device.hello()
+    assert hello.angular_rate_limit_radps == (
+        None if rate_dps is None else pytest.approx(math.radians(rate_dps))
+    )
+    assert hello.specific_force_limit_mps2 == (None if force_g is None else pytest.approx(9.80665 * force_g))
 
 
 def test_refusal_is_in_words() -> None:

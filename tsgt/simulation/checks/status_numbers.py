@@ -152,12 +152,12 @@ def _offset_errors(master_log: MasterLog, indices: Mapping[int, JournalIndex]) -
         if station.clock_offset_ns is None or station.clock_bound_ns is None or not published.measurements:
             continue
         newest = published.measurements[-1]
+        if newest.stamp_bound_ns is None:
+            continue  # An error without a time: the stamp is its arrival
         journalled = indices[station.id].find(newest)
         if (
             journalled is not None
             and at_s * 1e9 + master_log.unix_at_zero_ns - newest.stamp_ns < FRESH_S * 1e9
         ):
             true_ns = journalled.stamp_ns - newest.stamp_ns
-            yield (station.clock_offset_ns - true_ns) / max(
-                1, station.clock_bound_ns + (newest.stamp_bound_ns or 0)
-            )
+            yield (station.clock_offset_ns - true_ns) / max(1, station.clock_bound_ns + newest.stamp_bound_ns)

@@ -181,9 +181,14 @@ def test_age_of_a_distance_stamped_before_the_angles_that_precede_it(
     assert len(found) == count
 
 
-@pytest.mark.parametrize(("offset_ns", "count"), [(5_000, 0), (50_000, 1), (-50_000, 1)])
-def test_clock_offset_beyond_its_bound(tmp_path: Path, offset_ns: int, count: int) -> None:
-    """In each of 30 statuses; the station's clock is that of the master."""
+@pytest.mark.parametrize(
+    ("offset_ns", "bound_ns", "count"),
+    [(5_000, 0, 0), (50_000, 0, 1), (-50_000, 0, 1), (-50_000, 45_000, 0), (50_000, None, 0)],
+)
+def test_clock_offset_beyond_its_bound(
+    tmp_path: Path, offset_ns: int, bound_ns: int | None, count: int
+) -> None:
+    """In each of 30 statuses; the station's clock is that of the master. A stamp without a bound, the arrival of an error, tells no offset."""
     statuses = [
         replace(
             _status(clock_offset_ns=offset_ns, clock_bound_ns=10_000, age_s=0.6 + number, last_heard_s=0.0),
@@ -194,7 +199,10 @@ def test_clock_offset_beyond_its_bound(tmp_path: Path, offset_ns: int, count: in
     records: list[object] = []
     for number, status in enumerate(statuses):
         fresh = replace(
-            measurement(number), stamp_ns=status.stamp_ns - SECOND // 2, received_ns=status.stamp_ns
+            measurement(number),
+            stamp_ns=status.stamp_ns - SECOND // 2,
+            received_ns=status.stamp_ns,
+            stamp_bound_ns=bound_ns,
         )
         records += [fresh, status]
     found = [each for each in status_failures(_log(tmp_path, *records), _INDICES) if "offsets" in each]

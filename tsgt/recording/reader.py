@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, field
+from statistics import median
 from typing import TYPE_CHECKING, TypeVar
 
 from tsgt.errors import CorruptLineError, RecordingError
@@ -41,6 +43,12 @@ _TAGS: dict[type, str] = {ImuSamples: "imu", OdometrySamples: "odometry"}
 
 SAME_MEASUREMENT_NS = 1_000_000_000
 """Two masters give a measurement times that differ by less. Later, a robot at rest may give all of its values again."""
+
+MIN_JUDGED = 10
+"""Fewer measurements are not judged by their units: some may be damaged."""
+
+MAX_ZENITH_RAD, MAX_DISTANCE_M = 7.0, 10_000.0
+"""Limits of medians: a full turn, and what no total station measures."""
 
 _MEASUREMENTS: dict[str, type[Measurement]] = {"measurement": PolarMeasurement, "point": PointMeasurement}
 
@@ -138,7 +146,8 @@ def load_recording(
 
     Where the set-up was replaced while the master ran, what precedes the last set-up is left out: the tripods may have
     stood elsewhere. ``whole``: include it. ``imu``: also read the samples of the robot's IMU and wheel odometry. ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
-    cannot be read. Raises RecordingError as :func:`read_lines`, and without parameters in the file.
+    cannot be read. Raises RecordingError as :func:`read_lines`, without parameters in the file, and where
+    angles or distances are in another unit.
     """
     header: RecordingHeader | None = None
     parameters: Parameters | None = None
@@ -197,6 +206,7 @@ def load_recording(
         measurements = [each for each in measurements if each.stamp_ns >= valid_from_ns]
     if header is None or parameters is None:  # read_lines has checked the header
         raise RecordingError("contains no parameters; the program that wrote it ended too early", path=path)
+    _check_units(measurements, path)
     return Recording(
         header=header,
         parameters=parameters,
@@ -207,6 +217,25 @@ def load_recording(
         left_out=left_out + len(early),
         set_ups_differ=set_ups_differ,
     )
+
+
+def _check_units(measurements: list[Measurement], path: Path) -> None:
+    """Raise RecordingError where angles or distances are in another unit: no robot fits them, which a search finds out slowly."""
+    angles = [abs(each.zenith_angle_rad) for each in measurements if isinstance(each, PolarMeasurement)]
+    distances = [
+        math.hypot(*each.position_m) if isinstance(each, PointMeasurement) else each.slope_distance_m or 0.0
+        for each in measurements
+    ]
+    for values, name, median_name, limit, unit in (
+        (angles, "angles", "median zenith angle", MAX_ZENITH_RAD, "rad"),
+        (distances, "distances", "median", MAX_DISTANCE_M, "m"),
+    ):
+        if len(values) >= MIN_JUDGED and (found := median(values)) > limit:
+            raise RecordingError(
+                f"its {name} are in another unit: the {median_name} is {found:.6g}, but in {unit} it is at most "
+                f"{limit:g}; convert them to {unit}",
+                path=path,
+            )
 
 
 def _identity(measurement: Measurement) -> object:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from harness.files.records import (
@@ -340,3 +340,33 @@ def test_one_run_keeps_equal_measurements(path: Path) -> None:
     """Nothing is left out of a file that is no join, whatever the master wrote."""
     path.write_bytes(recording_bytes(measurement(5), measurement(5)))
     assert load_recording(path).measurements == [measurement(5), measurement(5)]
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        (
+            {"zenith_angle_rad": 89.7},
+            "its angles are in another unit: the median zenith angle is 89.7, but in rad",
+        ),
+        ({"slope_distance_m": 41_234.0}, "its distances are in another unit: the median is 41234, but in m"),
+    ],
+)
+def test_other_units_are_an_error(path: Path, changed: dict[str, Any], expected: str) -> None:
+    """A search for poses takes minutes, and finds none; single measurements may be damaged."""
+    path.write_bytes(recording_bytes(*(replace(measurement(number), **changed) for number in range(30))))
+    with pytest.raises(RecordingError, match=expected):
+        load_recording(path)
+    few = [replace(measurement(number), **(changed if number % 3 else {})) for number in range(9)]
+    path.write_bytes(recording_bytes(*few))
+    assert len(load_recording(path).measurements) == 9
+
+
+def test_points_in_another_unit_are_an_error(path: Path) -> None:
+    """Points in millimetres likewise."""
+    points = (replace(POINT, sequence=number, position_m=(41_234.0, 2.0, 3.0)) for number in range(30))
+    path.write_bytes(recording_bytes(*points))
+    with pytest.raises(
+        RecordingError, match="its distances are in another unit: the median is 41234, but in m"
+    ):
+        load_recording(path)

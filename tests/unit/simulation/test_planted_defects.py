@@ -40,8 +40,8 @@ def test_planted_defect_is_detected_and_removed(script: ModuleType, key: str, ch
 
 @pytest.mark.slow
 def test_every_defect_replaces_existing_code(script: ModuleType) -> None:
-    """The replaced attributes exist and are restored; the named tests exist."""
-    for defect in script.DEFECTS.values():
+    """The replaced attributes exist and are restored; the named tests exist. Also of the independent ones."""
+    for defect in script.all_defects().values():
         planting = Planting()
         defect.plant(planting)
         places = [(owner, name, getattr(owner, name)) for owner, name, _ in planting.replaced]

@@ -39,6 +39,7 @@ STEADY_DRIFT = (
     2e-5  # Changes the offset by 3 ms within a part: below it, the latencies are those of the middle
 )
 MAX_ROUNDS = 4
+MAX_DRIFT = 2e-4  # Of an oscillator that nothing adjusts
 MAX_UNEVEN_S = (
     0.01  # rms of the latencies about a line, which clocks that are not stepped follow to a few milliseconds
 )
@@ -94,7 +95,8 @@ def align_clock(
     for number in range(MAX_ROUNDS):
         found = []
         for done, part in enumerate(parts):
-            report((number + done / len(parts)) / MAX_ROUNDS)
+            # One round as a rule, sometimes two.
+            report(1.0 - 0.5 ** (number + done / len(parts)))
             try:
                 found.append(_part_offset(part, samples, noise, gravity, clock))
             except GeometryError:
@@ -121,10 +123,11 @@ def fit_clock(parts: list[PartOffset]) -> ClockAlignment:
     line = covariance @ design.T @ (weights * offsets_s)
     residuals_s = offsets_s - design @ line
     rms_s = float(np.sqrt(np.mean(residuals_s**2)))
-    if rms_s > MAX_UNEVEN_S:
+    if rms_s > MAX_UNEVEN_S or abs(line[1]) > MAX_DRIFT:
         raise GeometryError(
-            f"the clock of the IMU did not run evenly: its offsets are {1e3 * rms_s:.0f} ms (rms) from a line. It was stepped, or "
-            "adjusted by a time server: import what was recorded before and after that by itself"
+            f"the clock of the IMU did not run evenly: its offsets are {1e3 * rms_s:.0f} ms (rms) from a line of {1e6 * line[1]:+.0f} ppm "
+            f"(limits {1e3 * MAX_UNEVEN_S:.0f} ms and {1e6 * MAX_DRIFT:.0f} ppm). It was stepped, or adjusted by a time server: import what "
+            "was recorded before and after that by itself"
         )
     freedom = len(parts) - MIN_PARTS
     scale = max(1.0, float(weights @ residuals_s**2) / freedom) if freedom else 1.0

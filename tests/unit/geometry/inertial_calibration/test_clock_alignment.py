@@ -62,6 +62,8 @@ def test_clock_that_was_stepped_is_an_error() -> None:
     """No line describes it."""
     with pytest.raises(GeometryError, match=r"did not run evenly: its offsets are .* ms"):
         fit_clock(parts(0.0, 0.0, 0.0, 0.1, 0.1, 0.1))
+    with pytest.raises(GeometryError, match=r"a line of \+1090 ppm \(limits 10 ms and 200 ppm\)"):
+        fit_clock(parts(0.0, 0.1))
 
 
 def test_single_part_does_not_tell_the_drift() -> None:

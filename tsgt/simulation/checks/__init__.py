@@ -6,7 +6,8 @@ checks measurements and journals; each other file is one check:
 - `poses` against truth, measurements and documentation: a room of its own;
 - stream and files: `recorded_lines`, `heard_lines`, `setup_lines`, `poll_replies`, `acknowledgements`;
 - status and events: `status_numbers`, `station_reports`, `station_events`, `outstanding`;
-- `liveness` after faults, `memory_bounds`, samples of IMU and wheels (`imu_samples`, `odometry_samples`).
+- `devices`, the IMU and the wheels of the robot: likewise;
+- `liveness` after faults, `memory_bounds`.
 """
 
 from tsgt.simulation.checks.invariants import Violation, check_invariants

@@ -17,10 +17,9 @@ from tsgt.master.replay import replayed
 from tsgt.model import Status
 from tsgt.recording import load_recording
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
+from tsgt.simulation.checks.devices import imu_failures, imu_status_failures, odometry_failures
 from tsgt.simulation.checks.heard_lines import heard_failures
-from tsgt.simulation.checks.imu_samples import imu_failures, imu_status_failures
 from tsgt.simulation.checks.liveness import liveness_failures
-from tsgt.simulation.checks.odometry_samples import odometry_failures
 from tsgt.simulation.checks.outstanding import outstanding_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
 from tsgt.simulation.checks.poses import (

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tsgt.simulation.checks.imu_samples import imu_status_failures
+from tsgt.simulation.checks.devices import imu_status_failures
 from tsgt.simulation.mission.master_log import PublishedCounts
 
 STATUSES = 12

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from tsgt.simulation.checks.sample_events import missing_events
+from tsgt.simulation.checks.devices.sample_events import missing_events
 
 ARRIVAL_S = np.concatenate([np.arange(0.0, 20.0, 0.05), np.arange(26.0, 60.0, 0.05)])
 

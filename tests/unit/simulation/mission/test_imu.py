@@ -20,7 +20,7 @@ from tsgt.geometry import log_so3, rotation_from_quaternion, transform_from, tra
 from tsgt.geometry.inertial_calibration import SetupCheck
 from tsgt.recording import load_recording, read_imu_samples
 from tsgt.simulation.checks import check_invariants
-from tsgt.simulation.checks.imu_samples import imu_failures
+from tsgt.simulation.checks.devices import imu_failures
 from tsgt.simulation.checks.invariants import replay_mismatches
 from tsgt.simulation.imu import (
     DeviceClockJump,

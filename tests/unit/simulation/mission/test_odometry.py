@@ -13,8 +13,8 @@ from tsgt.config import ScenarioConfig, SimulatedImu
 from tsgt.master.replay import replayed
 from tsgt.recording import load_recording, read_lines
 from tsgt.simulation.checks import check_invariants
-from tsgt.simulation.checks.odometry_samples import odometry_failures
-from tsgt.simulation.checks.sample_events import LOSS_EVENT_S
+from tsgt.simulation.checks.devices import odometry_failures
+from tsgt.simulation.checks.devices.sample_events import LOSS_EVENT_S
 from tsgt.simulation.faults import FaultKind
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import numpy as np
 
 from tsgt.errors import RecordingError
 from tsgt.recording import read_imu_samples
+from tsgt.simulation.checks.devices.sample_events import missing_events
 from tsgt.simulation.checks.liveness import RECOVERY_TIME_S
-from tsgt.simulation.checks.sample_events import missing_events
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

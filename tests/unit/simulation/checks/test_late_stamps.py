@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from harness.files.records import measurement
 
-from tsgt.simulation.checks.poses.late_stamps import LATE_S, late_stamp_tolerances
+from tsgt.model import Status
+from tsgt.simulation.checks.poses.late_stamps import LATE_S, extrapolated_s, late_stamp_tolerances
 from tsgt.simulation.instrument import ReportedDistance
 
 SPEED_MPS = 1.5
@@ -79,3 +82,21 @@ def test_robot_that_has_slowed_down_was_measured_while_it_was_fast() -> None:
     result: Any = SimpleNamespace(parameters=SimpleNamespace(prisms=[prism]), true_poses=stops_at_70_s)
     found = late_stamp_tolerances(result, [_index(5, 65)], np.array([69.0, 71.5, 73.0]))[:, 0]
     np.testing.assert_allclose(found, 3.0 * LATE_S * SPEED_MPS * np.array([1.0, 1.0, 0.0]), atol=1e-9)
+
+
+def test_prism_that_was_unmeasured_longest_when_a_pose_was_published() -> None:
+    """By what had arrived before it; an unusable measurement, or a station without any yet, says nothing."""
+    measured = [
+        replace(measurement(0), station=station, stamp_ns=round(1e9 * at_s), status=status)
+        for station, at_s, status in [
+            (1, 10.0, Status.OK),
+            (2, 9.4, Status.OK),
+            (2, 10.1, Status.NO_TARGET),
+            (1, 10.4, Status.OK),
+            (2, 10.3, Status.OK),
+        ]
+    ]
+    poses: Any = SimpleNamespace(measurements_before=np.array([0, 1, 3, 4, 5, 5]))
+    at_s = np.array([10.2, 10.2, 10.2, 10.5, 10.5, 10.0])
+    found = extrapolated_s(poses, measured, at_s, 0)
+    np.testing.assert_allclose(found, [0.0, 0.2, 0.8, 1.1, 0.2, 0.0], atol=1e-9)

@@ -12,7 +12,7 @@ from tsgt.geometry import invert, log_so3, rotation_from_quaternion, transform_f
 from tsgt.model import MIN_PRISMS
 from tsgt.simulation.checks.poses.apparent import apparent_poses, misfit_tolerances
 from tsgt.simulation.checks.poses.knocks import displaced_covariance, displacements, untold_displacements
-from tsgt.simulation.checks.poses.late_stamps import late_stamp_tolerances
+from tsgt.simulation.checks.poses.late_stamps import VELOCITY_S, extrapolated_s, late_stamp_tolerances
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -84,7 +84,11 @@ def nees_outliers(
     errors, nees, misfits = _errors(poses, master_log, result)
     error_norms = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
     at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
-    limits = _STATE_TOLERANCE + untold + misfits + late_stamp_tolerances(result, indices.values(), at_s)
+    late = late_stamp_tolerances(result, indices.values(), at_s)
+    if late.any():
+        beyond_s = extrapolated_s(poses, master_log.measurements, at_s, master_log.unix_at_zero_ns)
+        late *= (1.0 + np.minimum(beyond_s, UNSEEN_S) / VELOCITY_S)[:, None]
+    limits = _STATE_TOLERANCE + untold + misfits + late
     for index in np.flatnonzero((nees > _MAX_NEES) & (error_norms > limits).any(axis=1)).tolist():
         yield (
             f"{poses.series[index]} pose at {poses.stamp_ns[index]} ns: error {error_norms[index, 0]:.4f} m at the prisms' centroid and "

@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tsgt.estimation import usable
 from tsgt.geometry import log_so3
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from tsgt.simulation.mission import JournalIndex, MissionResult
+    from tsgt.model import PolarMeasurement
+    from tsgt.simulation.mission import JournalIndex, MissionResult, ValidPoses
 
 LATE_S = 0.03
 """Delay of the stamps of a fit that began while responses took k times as long as usual, over k - 1: 70 ms are seen where k is
@@ -24,6 +26,9 @@ four. Nothing tells the client (docs/explanation/instrument-time.md).
 
 MEMORY_S = np.arange(0.0, 2.1, 0.5)
 """Ages of the measurements that poses rest on: the robot may have been faster when it was measured last."""
+
+VELOCITY_S = 0.5
+"""Late stamps that come and go displace a velocity by as much as a position, over this time: it is known from measurements of as long."""
 
 _HALF_STEP_S = 0.05  # Of the differences that give the robot's speed
 
@@ -56,6 +61,25 @@ def _tolerances(
             arm_m = min(float(np.linalg.norm(a - b)) for a, b in combinations(prisms_m, 2))
             tolerances[:, 1] += tolerances[:, 0] / arm_m
     return tolerances
+
+
+def extrapolated_s(
+    poses: ValidPoses,
+    measurements: Sequence[PolarMeasurement],
+    at_s: NDArray[np.float64],
+    unix_at_zero_ns: int,
+) -> NDArray[np.float64]:
+    """Return how long before poses at true times, (N,), the prism was measured that had been unmeasured longest when they were published."""
+    longest_s = np.zeros(len(at_s))
+    for station in {each.station for each in measurements}:
+        rows = [n for n, each in enumerate(measurements) if each.station == station and usable(each)]
+        if not rows:
+            continue
+        newest_s = np.maximum.accumulate([(measurements[n].stamp_ns - unix_at_zero_ns) / 1e9 for n in rows])
+        known = np.searchsorted(rows, poses.measurements_before)
+        since_s = at_s - newest_s[np.maximum(known - 1, 0)]
+        longest_s = np.maximum(longest_s, np.where(known > 0, since_s, 0.0))
+    return longest_s
 
 
 def stamps_are_late(indices: Iterable[JournalIndex], at_s: float) -> bool:

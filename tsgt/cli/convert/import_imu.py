@@ -42,7 +42,7 @@ _NOISE = "consumer"  # Which class it is matters little to its clock
     type=path_type,
     metavar="RECORDING",
     help="Find offset and drift of the files' clock from the motion of the robot in this recording of three stations, and remove "
-    "them with the delay of the stamps.",
+    "them with the latency of the stamps.",
 )
 @click.option(
     "--output",
@@ -90,7 +90,7 @@ def import_imu(
     if clock is not None:
         found = _json(clock)
         click.echo(
-            "clock of the files less the master's, with the delay of the stamps: "
+            "clock of the files less the master's, with the latency of the stamps: "
             "{offset_ms:.1f} ms (sigma {offset_sigma_ms:.1f}) and {drift_ppm:.1f} ppm ({drift_sigma_ppm:.1f}), "
             "from {parts} parts of the drive that differ by {rms_ms:.1f} ms (rms)".format(**found)
         )

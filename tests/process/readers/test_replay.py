@@ -21,7 +21,8 @@ def test_replay_that_is_ended_leaves_no_socket(tmp_path: Path, number: signal.Si
     recording, path = tmp_path / "r.jsonl", tmp_path / "poses.sock"
     stretched = (replace(measurement(n), slope_distance_m=30_000.0 + n) for n in range(50))
     recording.write_bytes(recording_bytes(*stretched))
-    command = [sys.executable, "-m", "tsgt", "replay", recording, "--socket", path, "--no-wait"]
+    replays = [sys.executable, "-m", "tsgt", "replay", "--no-wait"]
+    command = [*replays, str(recording), "--socket", str(path)]
     with Program(command, tmp_path, "replay") as replay:
         wait_for(path.exists, replay.process, shows=tmp_path / "replay.err")
         replay.process.send_signal(number)

@@ -32,7 +32,7 @@ from tsgt.simulation.checks.poses import (
     scale_failures,
     twist_failures,
 )
-from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
+from tsgt.simulation.checks.recorded_lines import lost_lines, recording_failures, size_failures
 from tsgt.simulation.checks.setup_lines import beacon_failures, parameter_failures, setup_failures
 from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.station_reports import report_failures
@@ -106,6 +106,7 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
     found += (Violation("status", what) for what in report_failures(result))
     for master_log in result.master_logs:
         in_force = result.in_force(master_log)
+        lost = lost_lines(master_log)
         found += (Violation("setup", what) for what in parameter_failures(master_log, in_force.parameters))
         found += (Violation("recording", what) for what in recording_failures(master_log))
         found += (Violation("status", what) for what in size_failures(master_log))
@@ -123,13 +124,13 @@ def check_invariants(result: MissionResult, *, replay: bool = True) -> list[Viol
             Violation("event", what) for what in event_failures(master_log, superframe=result.superframe)
         )
         found += (Violation("event", what) for what in layout_failures(master_log, result))
-        found += duplicate_deliveries(master_log)
+        found += duplicate_deliveries(master_log, lost)
         found += timestamp_violations(
             master_log, indices, start_ns=master_log.unix_at_zero_ns, slewed_ns=partial(_slewed_ns, result)
         )
         found += (Violation("pose", what) for what in pose_failures(master_log, in_force, indices))
         if replay:
-            found += replay_mismatches(master_log)
+            found += replay_mismatches(master_log, lost)
     found += (Violation("imu", what) for what in imu_failures(result))
     found += (Violation("imu", what) for what in imu_status_failures(result))
     found += (Violation("odometry", what) for what in odometry_failures(result))
@@ -277,16 +278,25 @@ def lost_measurements(
         )
 
 
-def duplicate_deliveries(master_log: MasterLog) -> Iterator[Violation]:
-    """Find measurements that were delivered more than once."""
+def duplicate_deliveries(master_log: MasterLog, lost: Sequence[range] = ()) -> Iterator[Violation]:
+    """Find measurements that were delivered more than once.
+
+    One whose line is among the ``lost`` ones of the recording is not acknowledged, and is delivered again.
+    """
+    come_again = {
+        number
+        for number, line in enumerate(master_log.measurement_lines)
+        if any(line in each for each in lost)
+    }
     seen = set()
-    for measurement in master_log.measurements:
+    for number, measurement in enumerate(master_log.measurements):
         over_superframe = measurement.host_time_ns is None
         identity = measurement.sequence if over_superframe else (measurement.host_time_ns, measurement.status)
         key = (measurement.station, identity)
         if measurement.stamp_sigma_ns < UNTIMED_SIGMA_NS and key in seen:
             yield Violation("duplicate", f"station {measurement.station}: delivered twice: {measurement}")
-        seen.add(key)
+        if number not in come_again:
+            seen.add(key)
 
 
 def timestamp_violations(
@@ -337,16 +347,19 @@ def _slewed_ns(result: MissionResult, station: int, true_ns: int) -> float:
     )
 
 
-def replay_mismatches(master_log: MasterLog) -> Iterator[Violation]:
-    """Compare the stream with a replay of the recording."""
+def replay_mismatches(master_log: MasterLog, lost: Sequence[range] = ()) -> Iterator[Violation]:
+    """Compare the stream with a replay of the recording, up to the first of its ``lost`` lines."""
     path = master_log.recording()
     if path is None:
         return  # the check of the recording tells whether it should have one
     count = 0
+    expected = master_log.line_hashes[: lost[0].start] if lost else master_log.line_hashes
     try:
         for _, lines in replayed(path):
             for line in lines:
-                if count == len(master_log.line_hashes) or hash(line) != master_log.line_hashes[count]:
+                if lost and count == len(expected):
+                    return
+                if count == len(expected) or hash(line) != expected[count]:
                     yield Violation(
                         "replay",
                         f"{path.name}: line {count + 1} of the replay differs from the stream: {line[:200]!r}",
@@ -356,11 +369,8 @@ def replay_mismatches(master_log: MasterLog) -> Iterator[Violation]:
     except RecordingError as error:
         yield Violation("replay", str(error))
         return
-    if count < len(master_log.line_hashes) and not master_log.crashed:
-        yield Violation(
-            "replay",
-            f"{path.name}: the replay has {count} lines, the stream {len(master_log.line_hashes)}",
-        )
+    if count < len(expected) and not master_log.crashed:
+        yield Violation("replay", f"{path.name}: the replay has {count} lines, the stream {len(expected)}")
 
 
 def _same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> bool:

@@ -97,6 +97,7 @@ class MasterLog:
         self.crashed = False  # whether it was killed
         self.session_number: int | None = None  # session number of its last beacon
         self.measurements: list[PolarMeasurement] = []
+        self.measurement_lines = array("q")  # number of each measurement's line on the stream
         self.arrived_ns: list[int] = []  # True time of each measurement's publication, in ns from the start
         self.clocks: list[ClockRecord] = []
         self.statuses: list[StatusRecord] = []
@@ -142,6 +143,7 @@ class MasterLog:
             return
         if isinstance(record, PolarMeasurement):
             self.measurements.append(record)
+            self.measurement_lines.append(len(self.line_hashes) - 1)
             self.arrived_ns.append(self._now_ns())
         elif isinstance(record, ClockRecord):
             self.clocks.append(record)

@@ -24,13 +24,14 @@ from harness.files.records import (
 from tsgt.model import Status
 from tsgt.radio.classic import OK, MeasurementMessage
 from tsgt.recording import RecordingStatus, StationStatus, StatusRecord, encode_line
+from tsgt.recording.recorder import MAX_PENDING_LINES
 from tsgt.simulation.checks.acknowledgements import missing_acknowledgements
 from tsgt.simulation.checks.heard_lines import heard_failures
 from tsgt.simulation.checks.outstanding import outstanding_failures
 from tsgt.simulation.checks.poll_replies import unpublished_replies
 from tsgt.simulation.checks.poses.ages import age_failures
 from tsgt.simulation.checks.poses.expected import missing_poses
-from tsgt.simulation.checks.recorded_lines import recording_failures, size_failures
+from tsgt.simulation.checks.recorded_lines import lost_lines, recording_failures, size_failures
 from tsgt.simulation.checks.station_events import event_failures
 from tsgt.simulation.checks.status_numbers import status_failures
 from tsgt.simulation.mission import MasterLog
@@ -74,6 +75,22 @@ def test_recording_that_ends_early(tmp_path: Path, *, crashed: bool) -> None:
     whole = b"".join(encode_line(record) + b"\n" for record in (HEADER, PARAMETERS, measurement(0), POSE))
     (tmp_path / "a.jsonl").write_bytes(whole[:-9])
     assert bool(list(recording_failures(log))) != crashed
+
+
+@pytest.mark.parametrize(
+    ("stated", "waiting", "count"), [(2, MAX_PENDING_LINES, 0), (1, MAX_PENDING_LINES, 1), (2, 99, 1)]
+)
+def test_lines_that_are_lost(tmp_path: Path, stated: int, waiting: int, count: int) -> None:
+    """Only as many as the status counts, and only of more than a master keeps for a full disk."""
+    recording = RecordingStatus(
+        file="a.jsonl", bytes=0, last_write_ns=None, waiting_lines=waiting, lost_lines=stated
+    )
+    status = replace(STATUS, recording=recording)
+    log = _log(tmp_path, measurement(0), POSE, EVENT, status)
+    records = (HEADER, PARAMETERS, measurement(0), status)
+    (tmp_path / "a.jsonl").write_bytes(b"".join(encode_line(record) + b"\n" for record in records))
+    assert len(list(recording_failures(log))) == count
+    assert lost_lines(log) == [range(1, 3)]
 
 
 @pytest.mark.parametrize(

@@ -39,9 +39,10 @@ class PipelineConfig(Model):
     rate_hz: Annotated[float, Field(ge=0.01, le=1000)] = 20.0
     """Poses per second; with an IMU, whose samples say what the robot does in between, 20 to 100."""
     outage_limit_s: Positive = 1.0
-    """Maximum gap between two measurements of a prism; no poses in longer gaps."""
+    """Longest gap between two measurements of a prism before it counts as missing: `linear` gives no valid pose then, `continuous`
+    degraded ones while their sigmas are within the limits."""
     transport_limit_s: Positive = 2.0
-    """Maximum time to wait for a measurement."""
+    """Maximum time that a pose waits for a measurement; for `linear`."""
     residual_limit_mm: Positive = 50.0
     """Maximum layout residual of a valid pose (root mean square)."""
     tilt_limit_deg: Annotated[float, Field(gt=0, le=180)] = 90.0

@@ -44,9 +44,10 @@ class PipelineParameters(FiniteNumbers):
     period_ns: int = 50_000_000
     """Interval of the pose epochs in ns; epochs are the whole multiples of it in Unix time."""
     outage_limit_ns: int = 1_000_000_000
-    """A longer interval between two measurements of a prism, in ns, is an outage without valid poses."""
+    """A longer interval between two measurements of a prism, in ns, is an outage: no valid poses with `linear`, degraded ones with
+    `continuous` while their sigmas are within the limits."""
     transport_limit_ns: int = 2_000_000_000
-    """A measurement that has not arrived this long after it was made, in ns, is not waited for."""
+    """A measurement that has not arrived this long after it was made, in ns, is not waited for. For `linear`."""
     residual_limit_m: float = 0.05
     """A pose whose prisms miss the layout by more than this (root mean square over the prisms) is invalid."""
     tilt_limit_rad: float = math.pi / 2

@@ -199,7 +199,7 @@ def layout_command(
     if as_json:
         print_json(
             {
-                "by": criterion,
+                "objective": criterion,
                 "reference_point": dataclasses.asdict(at),
                 "stances": len(robot_poses.position_m),
                 "ranking": [each.name for each in candidates],

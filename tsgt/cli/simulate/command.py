@@ -410,7 +410,7 @@ def _print(result: dict[str, Any], found: list[Violation]) -> None:
             *numbers(*(station["age_ms"][key] for key in ("p50", "p99")), digits=0),
             f"{station['within_2s']:.2%}",
             *numbers(*(station["time_error_us"][key] for key in ("p50", "p99", "max")), digits=0),
-            *("-" if station[key] is None else str(station[key]) for key in ("queued", "late_slots")),
+            *("-" if station[key] is None else str(station[key]) for key in ("queued", "missed_slots")),
         ]
         for number, station in result["stations"].items()
     ]

@@ -177,9 +177,11 @@ class Progress:
             label, _ = station_label(station)
             rate = "" if station.rate_hz is None else f"  {station.rate_hz:.2f} Hz"
             strength = "" if station.rssi_dbm is None else f"  {station.rssi_dbm:.0f} dBm"
-            bound_ns = station.stamp_bound_ns if station.clock_bound_ns is None else station.clock_bound_ns
-            clock = "" if bound_ns is None else f"  clock bound {bound_ns / 1e6:.2f} ms"
-            lines.append(f"         station {station.id}  {label}{rate}{strength}{clock}")
+            bounds_ns = {"clock": station.clock_bound_ns, "timestamp": station.stamp_bound_ns}
+            bound = next(
+                (f"  {of} bound {ns / 1e6:.2f} ms" for of, ns in bounds_ns.items() if ns is not None), ""
+            )
+            lines.append(f"         station {station.id}  {label}{rate}{strength}{bound}")
         if self._live is None:
             click.echo("\n".join(lines), err=True)
         else:

@@ -44,7 +44,7 @@ class StationFigures:
         Percentiles 50 and 99 of the time from measurement to pipeline in ms; NaN without measurements.
     within_2s
         Share of the measurements that reached the pipeline within :data:`IN_TIME_NS`.
-    queued, late_slots
+    queued, missed_slots
         Measurements left in the station's send queue, and missed slots; None if the protocol has neither.
     """
 
@@ -56,7 +56,7 @@ class StationFigures:
     age_ms: tuple[float, float]
     within_2s: float
     queued: int | None
-    late_slots: int | None
+    missed_slots: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ def _station_figures(run: MissionResult, number: int, stations: dict[int, _Stati
         age_ms=_percentiles(_ages_ns(deliveries), 50, 99, unit_ns=1e6),
         within_2s=_within_2s(_ages_ns(deliveries), len(station.measured_ns)),
         queued=statuses[-1].queued if statuses else None,
-        late_slots=sum(status.missed_slots or 0 for status in statuses) if run.superframe else None,
+        missed_slots=sum(status.missed_slots or 0 for status in statuses) if run.superframe else None,
     )
 
 
@@ -270,5 +270,5 @@ def _station_keys(station: StationFigures) -> dict[str, Any]:
         "age_ms": dict(zip(("p50", "p99"), station.age_ms, strict=True)),
         "within_2s": station.within_2s,
         "queued": station.queued,
-        "late_slots": station.late_slots,
+        "missed_slots": station.missed_slots,
     }

@@ -31,7 +31,7 @@ def test_json_has_the_documented_keys(tsgt: Tsgt) -> None:
     found = tsgt("simulate", "dynamic", *CLASSIC, "--stations", 1, "--duration", 20, "--json").json()
     station = found["stations"]["1"]
     assert station.keys() >= {"measured", "delivered", "duplicates", "rate_hz", "time_error_us"}
-    assert station.keys() >= {"age_ms", "within_2s", "queued", "late_slots"}
+    assert station.keys() >= {"age_ms", "within_2s", "queued", "missed_slots"}
     assert station["time_error_us"].keys() == {"p50", "p99", "max"}
     assert station["age_ms"].keys() == {"p50", "p99"}
     assert station["measured"] in {44, 45}  # connecting takes two seconds
@@ -60,7 +60,7 @@ def test_json_has_the_keys_of_the_superframe(tsgt: Tsgt) -> None:
     assert 100 < found["frame_ms"] < 500
     station = found["stations"]["2"]
     assert station["queued"] < 5
-    assert station["late_slots"] >= 0
+    assert station["missed_slots"] >= 0
     (outage,) = found["outages"]
     assert (outage["stations"], outage["start_s"], outage["seconds"]) == ([2], 8, 4)
     assert 0 < outage["drained_s"] < 5

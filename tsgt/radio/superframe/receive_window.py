@@ -57,7 +57,7 @@ class SequenceSet:
         if not numbers:
             return
         if numbers.start > self.highest + 1:
-            self._gaps.append(range(self.highest + 1, numbers.start))
+            self._add_gap(range(self.highest + 1, numbers.start))
         self.highest = max(self.highest, numbers.stop - 1)
         first = bisect_right(self._gaps, numbers.start, key=_start)
         first -= bool(first)
@@ -75,7 +75,15 @@ class SequenceSet:
     def remove(self, number: int) -> None:
         """Remove a number."""
         if number in self:
-            self._gaps.insert(bisect_right(self._gaps, number, key=_start), range(number, number + 1))
+            self._add_gap(range(number, number + 1))
+
+    def _add_gap(self, gap: range) -> None:
+        """Join it with its neighbours: an hour of lost measurements, removed one by one, is one gap."""
+        place = bisect_right(self._gaps, gap.start, key=_start)
+        before = [each for each in self._gaps[max(place - 1, 0) : place] if each.stop == gap.start]
+        after = [each for each in self._gaps[place : place + 1] if each.start == gap.stop]
+        joined = [*before, gap, *after]
+        self._gaps[place - len(before) : place + len(after)] = [range(joined[0].start, joined[-1].stop)]
 
     def truncate(self, stop: int) -> None:
         """Remove all numbers from this one on."""

@@ -59,6 +59,7 @@ def test_sequence_set_equals_python_set(steps: list[tuple[str, int, int]]) -> No
         missing = set(range(highest + 1)) - truth
         assert numbers.missing == len(missing)
         assert numbers.cumulative == min(missing, default=highest + 1) - 1
+        assert len(numbers._gaps) == len(missing - {number + 1 for number in missing})
 
 
 def test_large_gaps_take_no_memory() -> None:

@@ -43,3 +43,18 @@ def test_short_silence_needs_no_event() -> None:
     """Lines may be late."""
     arrival_s = np.concatenate([np.arange(0.0, 20.0, 0.05), np.arange(22.0, 60.0, 0.05)])
     assert not list(missing_events(master_log(), arrival_s, "imu"))
+
+
+@pytest.mark.parametrize(
+    ("events", "count"),
+    [
+        ([(21.2, "imu_lost"), (29.3, "imu_recovered")], 0),
+        ([(21.2, "imu_lost"), (26.1, "imu_recovered"), (27.3, "imu_lost"), (29.3, "imu_recovered")], 0),
+        ([(21.2, "imu_lost"), (26.1, "imu_recovered")], 1),  # and was lost again
+        ([(21.2, "imu_lost")], 1),
+    ],
+)
+def test_silence_that_follows_at_once_may_be_the_same(events: list[tuple[float, str]], count: int) -> None:
+    """A device that gives a few samples in between may count as lost throughout."""
+    arrival_s = np.concatenate([np.arange(0.0, 20.0, 0.05), [26.0, 26.05], np.arange(29.0, 60.0, 0.05)])
+    assert len(list(missing_events(master_log(*events), arrival_s, "imu"))) == count

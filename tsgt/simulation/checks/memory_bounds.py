@@ -26,6 +26,7 @@ STATED_BOUNDS = {
     ("StationIngest", "_known"): DUPLICATE_WINDOW,
     ("Recorder", "_queue"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,
     ("SuperframeLink", "_unsynced"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,  # whose lines wait there
+    ("_Stream", "pending"): HUNG_DISK_FACTOR * MAX_PENDING_LINES,  # likewise
     ("SendQueue", "_queue"): QUEUE_CAPACITY,
     ("SendQueue", "_runs"): QUEUE_CAPACITY // 2,  # every other one is acknowledged
     ("Backlog", "queued"): QUEUE_CAPACITY,

@@ -10,6 +10,7 @@ import numpy as np
 
 from tsgt.errors import GeometryError
 from tsgt.estimation import (
+    MAX_SHOCKS,
     SHOCK_INTERVAL_NS,
     UNWATCHED_NS,
     InertialSetupUncertainty,
@@ -72,6 +73,10 @@ MOVED_SQUARE = 25.0  # Squared distance in sigmas of two successive measurements
 
 NOISE_SCALE_PRIOR = 30.0
 """Components as many as the prior on a factor on the noise is worth; the factor 1 is that of the data sheet."""
+
+
+EARLIER_SHOCK_S = 2.0 * SHOCK_INTERVAL_NS / 1e9
+"""Shocks that masters before the recording measured are taken to be so long before it, and apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +221,8 @@ def fit_with_imu(
             for each in contradicted
         ]
     _check_biases(found, imu.noise)
-    shocks_s, moved_s = shock_times_s(recorded), first_move_s(found)
+    earlier_s = start_s - EARLIER_SHOCK_S * np.arange(min(imu.shocks_before, MAX_SHOCKS), 0, -1)
+    shocks_s, moved_s = np.concatenate([earlier_s, shock_times_s(recorded)]), first_move_s(found)
     first_shock_s = float(shocks_s.min(initial=np.inf))
     complete = not few_prisms and np.isinf(first_untold_s(observations, moved_s))
     if complete and ((shocks_s > moved_s - LONG_AFTER_S) & (shocks_s < moved_s + WINDOW_S)).any():

@@ -7,6 +7,7 @@ hold and validate poses; `reference_point` carries them to another point of the 
 """
 
 from tsgt.estimation.inertial import (
+    MAX_SHOCKS,
     MOVE_CAUSES,
     SHOCK_INTERVAL_NS,
     UNWATCHED_NS,
@@ -59,6 +60,7 @@ from tsgt.estimation.tracks import (
 
 __all__ = [
     "MAX_DISTANCE_M",
+    "MAX_SHOCKS",
     "MOVE_CAUSES",
     "POINT_COMMENT",
     "SHOCK_INTERVAL_NS",

@@ -99,6 +99,11 @@ class LiveEstimator:
         """Return the events on the set-up of the IMU since the last call; a replay finds them in its recording."""
         return () if self._setup is None else self._setup.take_events()
 
+    @property
+    def imu_shocks(self) -> int:
+        """Number of shocks after which no drive has confirmed the IMU's set-up, those before the start included."""
+        return 0 if self._setup is None else self._setup.shocks
+
     def outside_lag_window(self) -> Mapping[int, int] | None:
         """Return by station how many measurements arrived outside the lag window; None with ``linear``."""
         return None if self._continuous is None else self._continuous.outside_lag_window

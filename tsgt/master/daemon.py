@@ -29,6 +29,7 @@ from tsgt.master.monitors import (
     ImuUseMonitor,
     OdometryUseMonitor,
     RecordingDisk,
+    ShockMemory,
     disk_status,
     layout_monitor,
 )
@@ -150,6 +151,8 @@ async def run_master(
     def unix_now_ns() -> int:
         return timeline.unix_ns(clock.monotonic_ns())
 
+    shocks = ShockMemory(config.recording.directory)
+    parameters = shocks.recall(parameters)
     start_ns = unix_now_ns()
     server = StreamServer(
         config.stream.socket,
@@ -217,13 +220,14 @@ async def run_master(
 
                 def set_up(found: Parameters) -> None:
                     on_set_up(found)
+                    found = shocks.recall(found)
                     publisher.set_up(found, observers(found), recording.put)
                     hints.set_up(found)
                     server.greet_with(encode_line(HelloRecord.of(found)))
                     publisher.put(_setup_record(config, found, unix_now_ns(), path.name, dependencies.key))
 
                 stack.enter_context(reloading(dependencies.read_setup, set_up, publisher.report))
-                imu = _imu(config, timeline, publisher, dependencies)
+                imu = _imu(config, timeline, publisher, shocks, dependencies)
                 disk = RecordingDisk(recording, path, start_ns, dependencies.disk_status)
                 odometry = _odometry(config, timeline, publisher, dependencies)
                 master = _Master(clock, timeline, publisher, link, imu, odometry, disk)
@@ -241,6 +245,7 @@ async def run_master(
                     group.create_task(alarms.run())
                 if imu is not None:
                     group.create_task(imu.run())
+                    group.create_task(shocks.run(clock))
                 if odometry is not None:
                     group.create_task(odometry.run())
                 radio_opener = master.with_radio_events(dependencies.open_radio)
@@ -316,15 +321,24 @@ def _link(
 
 
 def _imu(
-    config: MasterConfig, timeline: UnixTimeline, publisher: Publisher, dependencies: MasterDependencies
+    config: MasterConfig,
+    timeline: UnixTimeline,
+    publisher: Publisher,
+    shocks: ShockMemory,
+    dependencies: MasterDependencies,
 ) -> Imu | None:
     if config.imu is None:
         return None
+
+    def take(samples: ImuSamples) -> None:
+        publisher.imu_samples(samples)
+        shocks.note(publisher.imu_shocks)
+
     return Imu(
         config.imu,
         dependencies.clock,
         timeline,
-        on_samples=publisher.imu_samples,
+        on_samples=take,
         on_event=lambda event, message: publisher.report(MasterEvent(event, message)),
         start=dependencies.start_imu,
     )

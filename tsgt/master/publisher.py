@@ -183,6 +183,11 @@ class Publisher:
         """Record samples of the IMU, in the order of arrival among all other lines, after the poses due before them."""
         self._send(self._estimator.imu_samples(samples), samples.received_ns)
 
+    @property
+    def imu_shocks(self) -> int:
+        """Number of shocks of the IMU, see :class:`~tsgt.estimation.LiveEstimator`."""
+        return self._estimator.imu_shocks
+
     def odometry_samples(self, samples: OdometrySamples) -> None:
         """Record samples of the wheel odometry likewise."""
         self._send(self._estimator.odometry_samples(samples), samples.received_ns)

@@ -111,6 +111,8 @@ class ImuParameters(FiniteNumbers):
     """Magnitude of gravity where the robot drives, in m/s^2."""
     tilt_sigma_rad: float = 1e-4
     """One sigma, per horizontal axis, of the angle between the z axis of frame ``station1`` and the vertical."""
+    shocks_before: int = 0
+    """Number of shocks that masters before this one measured with this mounting: each may have displaced the IMU."""
 
     def __post_init__(self) -> None:
         """Reject impossible parameters."""
@@ -119,6 +121,7 @@ class ImuParameters(FiniteNumbers):
             latency_ns=(-(10**10), 10**10),
             gravity_mps2=(9.7, 9.9),
             tilt_sigma_rad=(0, 0.1),
+            shocks_before=(0, 10**9),
         )
         check_coordinates("position_m", self.position_m)
         if not abs(math.hypot(*self.orientation_xyzw) - 1.0) < ROTATION_TOLERANCE:

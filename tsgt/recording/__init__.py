@@ -17,6 +17,7 @@ from tsgt.recording.format import (
     decode_line,
     encode_line,
 )
+from tsgt.recording.imu_shocks import IMU_SHOCKS_FILE, forget_imu_shocks, read_imu_shocks, write_imu_shocks
 from tsgt.recording.merged import MergedRecord
 from tsgt.recording.reader import (
     Recording,
@@ -57,6 +58,7 @@ from tsgt.recording.writer import RecordingWriter
 
 __all__ = [
     "FORMAT_VERSION",
+    "IMU_SHOCKS_FILE",
     "LOW_BATTERY_PERCENT",
     "LOW_DISK_BYTES",
     "MAX_LINE_BYTES",
@@ -89,14 +91,17 @@ __all__ = [
     "decode",
     "decode_line",
     "encode_line",
+    "forget_imu_shocks",
     "load_recording",
     "new_recording_path",
     "read_imu_samples",
+    "read_imu_shocks",
     "read_lines",
     "read_odometry",
     "read_target_checks",
     "replaced_line",
     "sync_folder",
     "write_atomically",
+    "write_imu_shocks",
     "write_target_checks",
 ]

@@ -185,6 +185,21 @@ def test_poses_of_one_station_allow_for_a_shock_before_them(stations: int, *, di
     assert (sigmas[after].min() > np.radians(0.5)) == displaced
 
 
+@pytest.mark.parametrize(("stations", "displaced"), [(3, False), (1, True)])
+def test_poses_of_one_station_allow_for_shocks_before_the_recording(
+    stations: int, *, displaced: bool
+) -> None:
+    """From its beginning on, if a master measured them that crashed."""
+    recording = imu_recording(DRIVE, stations=stations)
+    imu = recording.parameters.imu
+    assert imu is not None
+    before = replace(recording.parameters, imu=replace(imu, shocks_before=2))
+    found, plain = smooth(replace(recording, parameters=before)).poses, smooth(recording).poses
+    assert (((found.degraded & Degradation.IMU_UNCONFIRMED) != 0)[found.valid] == displaced).all()
+    more = (found.covariance - plain.covariance)[found.valid, 5, 5]
+    assert more == pytest.approx(2 * displaced * np.radians(0.5) ** 2, abs=2e-5)
+
+
 def test_poses_allow_for_each_shock() -> None:
     """Four knocks displace the IMU twice as far as one, on average; more are not allowed for."""
     recording = imu_recording(DRIVE, stations=1)

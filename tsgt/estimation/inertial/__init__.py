@@ -6,6 +6,7 @@ contradicted while the robot drives (`setup_monitor`), and the trajectory with o
 
 from tsgt.estimation.inertial.samples import SampleConverter, inertial_samples
 from tsgt.estimation.inertial.selection import (
+    MAX_SHOCKS,
     ImuState,
     OdometryState,
     unconfirmed_covariance,
@@ -22,6 +23,7 @@ from tsgt.estimation.inertial.setup_monitor import (
 from tsgt.estimation.inertial.wheels import wheel_samples
 
 __all__ = [
+    "MAX_SHOCKS",
     "MOVE_CAUSES",
     "SHOCK_INTERVAL_NS",
     "UNWATCHED_NS",

@@ -185,9 +185,12 @@ class ImuSetupMonitor:
         self._result: Callable[[], SetupCheck] | None = None
         self._result_ns = 0
         self._watched_until_ns: int | None = None
-        self._shocks, self._shock_ns = 0, -SHOCK_INTERVAL_NS
+        self._few_prisms = len(parameters.prisms) < MIN_PRISMS
+        self._shocks = 0 if parameters.imu is None else parameters.imu.shocks_before
+        self._shock_ns = -SHOCK_INTERVAL_NS
         self._standing: dict[Cause, SetupFinding] = {}
-        self._confirmed = self._was_confirmed = self._displaced = False
+        self._confirmed = self._was_confirmed = False
+        self._displaced = self._few_prisms and self._shocks > 0
         self._open = tuple(_PARTS.values())
         self._events: list[EventRecord] = []
 
@@ -257,7 +260,6 @@ class ImuSetupMonitor:
         configured for certain. Here, because lines that come late, or before the first measurement, reach no trajectory. They confirm
         again, too, after a time without samples; three prisms show at once what has changed.
         """
-        few_prisms = len(self._parameters.prisms) < MIN_PRISMS
         watched_until_ns, self._watched_until_ns = self._watched_until_ns, record.stamp_ns[-1]
         begin_ns = record.stamp_ns[0] - record.duration_ns[0]
         unwatched = watched_until_ns is not None and begin_ns - watched_until_ns > UNWATCHED_NS
@@ -268,9 +270,9 @@ class ImuSetupMonitor:
             shocks_ns = np.array(record.stamp_ns)[shocks]
             self._shocks += abs(int(shocks_ns[0]) - self._shock_ns) > SHOCK_INTERVAL_NS
             self._shock_ns = int(shocks_ns[-1])
-            self._displaced |= few_prisms
+            self._displaced |= self._few_prisms
             self._was_confirmed = False
-        if shocks.any() or (few_prisms and unwatched):
+        if shocks.any() or (self._few_prisms and unwatched):
             self.restart()
         self._records.append(record)
         while self._records[0].received_ns < record.received_ns - WINDOW_NS:
@@ -282,8 +284,7 @@ class ImuSetupMonitor:
             return
         parameters, measurements, records = self._parameters, tuple(self._measurements), tuple(self._records)
         self._result = self._start(lambda: check_recorded_setup(parameters, measurements, records))
-        few_prisms = len(parameters.prisms) < MIN_PRISMS
-        self._result_ns = now_ns + (RESULT_FEW_NS if few_prisms else RESULT_NS)
+        self._result_ns = now_ns + (RESULT_FEW_NS if self._few_prisms else RESULT_NS)
 
     def _judge(self, check: SetupCheck, now_ns: int) -> None:
         self._open = tuple(part for cause, part in _PARTS.items() if cause not in check.excluded)

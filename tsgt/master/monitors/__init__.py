@@ -7,12 +7,14 @@ recording, and the configured command of a geofence.
 from tsgt.master.monitors.disk import RecordingDisk, disk_status
 from tsgt.master.monitors.imu import ImuUseMonitor, OdometryUseMonitor
 from tsgt.master.monitors.observers import GeofenceObserver, layout_monitor
+from tsgt.master.monitors.shocks import ShockMemory
 
 __all__ = [
     "GeofenceObserver",
     "ImuUseMonitor",
     "OdometryUseMonitor",
     "RecordingDisk",
+    "ShockMemory",
     "disk_status",
     "layout_monitor",
 ]

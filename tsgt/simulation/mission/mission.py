@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import math
+import shutil
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +22,7 @@ from tsgt.estimation import start_now
 from tsgt.master.daemon import MasterDependencies, run_master
 from tsgt.radio.from_config import lora_settings
 from tsgt.radio.superframe.wire import KEY_BYTES
+from tsgt.recording import IMU_SHOCKS_FILE, read_imu_shocks
 from tsgt.simulation.imu import IMU_MODELS, ImuProgram, simulate_imu
 from tsgt.simulation.instrument import SimulatedLine, SimulatedTotalStation
 from tsgt.simulation.kernel import DriftingClock, VirtualClock, drift_ramp
@@ -253,7 +256,12 @@ class Mission:
         self.computers[MASTER].start(self._through_suspensions(master) if sleeps else master)
 
     def _new_master(self, suspended: ComputerSuspendedError | None = None) -> Coroutine[None, None, None]:
+        before = self.master_logs[-1] if self.master_logs else None
         master_log = self._new_master_log(f"master{len(self.master_logs)}", self.clock)
+        master_log.folder.mkdir()
+        if before is not None and (before.crashed or suspended is not None):  # not stopped by an operator
+            with suppress(FileNotFoundError):
+                shutil.copy(before.folder / IMU_SHOCKS_FILE, master_log.folder)
         self.master_logs.append(master_log)
         return self._master(master_log, self.computers[MASTER], self.clock, suspended)
 
@@ -270,6 +278,7 @@ class Mission:
         self._positions_m[name] = _INTERFERER_POSITION_M
         master_log = self._new_master_log(name.replace(" ", "-"), clock)
         self.other_master_logs.append(master_log)
+        master_log.folder.mkdir()
         computer.start(self._master(master_log, computer, clock))
         await asyncio.sleep(for_s)
         await computer.stop()
@@ -296,6 +305,9 @@ class Mission:
             parameters = replace(
                 edited, stations=tuple(stations), imu=parameters.imu, odometry=parameters.odometry
             )
+        if parameters.imu is not None:
+            shocks = read_imu_shocks(folder, parameters.imu)
+            parameters = replace(parameters, imu=replace(parameters.imu, shocks_before=shocks))
         master_log.parameters = parameters
         start_imu = None
         if self.imu is not None:
@@ -303,7 +315,6 @@ class Mission:
         start_odometry = None
         if self.odometry is not None:
             start_odometry = OdometryProgram(self.odometry, clock).start
-        folder.mkdir()
         writer = computer.new_writer()
         open_radio = computer.radio(settings)
         if not self.superframe:

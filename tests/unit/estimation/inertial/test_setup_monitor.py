@@ -57,12 +57,15 @@ class Monitored:
     checks: list[SetupCheck]
     seconds: int = 0
     prisms: int = 3
+    shocks_before: int = 0
 
     def __post_init__(self) -> None:
         drive = uncalibrated_drive(1.0)
         self.samples, self.point = imu_records(drive)[0], point_measurements(drive)[0]
         parameters = parameters_of(drive, drive.imu)
-        parameters = replace(parameters, prisms=parameters.prisms[: self.prisms])
+        assert parameters.imu is not None
+        imu = replace(parameters.imu, shocks_before=self.shocks_before)
+        parameters = replace(parameters, prisms=parameters.prisms[: self.prisms], imu=imu)
         self.monitor = ImuSetupMonitor(parameters, start=self.start)
 
     def start(self, _work: Callable[[], SetupCheck]) -> Callable[[], SetupCheck]:
@@ -147,6 +150,16 @@ def test_few_prisms_do_not_confirm_after_a_blow_before_them(prisms: int, *, conf
     monitored.monitor.samples(replace(shock(monitored.samples), received_ns=START - 10 * SECOND))
     monitored.run(22)
     assert monitored.monitor.confirmed == confirmed
+
+
+@pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
+def test_few_prisms_do_not_confirm_after_shocks_of_an_earlier_master(prisms: int, *, confirmed: bool) -> None:
+    """It has crashed, and this one knows of them."""
+    monitored = Monitored([RIGHT], prisms=prisms, shocks_before=2)
+    assert monitored.monitor.shocks == 2
+    monitored.run(22)
+    assert monitored.monitor.confirmed == confirmed
+    assert monitored.monitor.shocks == (0 if confirmed else 2)
 
 
 @pytest.mark.parametrize(("prisms", "shocks"), [(3, 0), (2, 3), (1, 3)])

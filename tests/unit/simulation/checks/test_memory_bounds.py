@@ -16,7 +16,7 @@ def test_measurements_of_a_delivered_backlog_are_within_their_bound(
     per_second: int, *, oversized: bool
 ) -> None:
     """Three stations deliver a minute's backlog with 25 measurements a second; the monitor keeps those of 50 s."""
-    parameters: Any = None
+    parameters: Any = SimpleNamespace(prisms=(1, 2, 3), imu=None)
     monitor = ImuSetupMonitor(parameters)
     for number in range(60 * per_second):
         measurement: Any = SimpleNamespace(received_ns=number * 1_000_000_000 // per_second)

@@ -37,7 +37,8 @@ def untold_displacements(
 
     A single prism tells no rotation of the IMU on the robot, and two none about their line: the poses are turned by it
     (docs/how-to/one-or-two-stations.md). A displacement is named from 50 mm on. A master knows of a knock by the shock that its samples
-    show, until it takes another set-up, and allows for it in the covariance. One that was started later, or had no samples of it, does not.
+    show, or those of a master before it that crashed, and allows for it in the covariance. One that was started by an operator later, or
+    had no samples of it, does not.
     """
     at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
     count = np.zeros(len(at_s))
@@ -76,10 +77,13 @@ def _knocks(master_log: MasterLog, result: MissionResult) -> Iterator[tuple[floa
         return
     path = master_log.recording()
     shocks_s = np.array([] if path is None else [*_shocks_s(path, master_log.unix_at_zero_ns)])
-    setups_s = [(setup.stamp_ns - master_log.unix_at_zero_ns) / 1e9 for setup in master_log.setups]
-    for knock_s in result.knocks_s:
-        seen = (np.abs(shocks_s - knock_s) < SHOCK_S).any()
-        yield knock_s, min((each for each in setups_s if each > knock_s), default=np.inf) if seen else knock_s
+    imu = (master_log.parameters or result.parameters).imu
+    earlier = 0 if imu is None else imu.shocks_before
+    for knock_s in sorted(result.knocks_s):
+        seen = bool((np.abs(shocks_s - knock_s) < SHOCK_S).any())
+        if not seen and earlier:
+            seen, earlier = True, earlier - 1
+        yield knock_s, np.inf if seen else knock_s
 
 
 def _shocks_s(path: Path, unix_at_zero_ns: int) -> Iterator[float]:

@@ -1,0 +1,51 @@
+"""Shocks that may have displaced the IMU: a file beside the recordings, for a master that starts after a crash.
+
+With fewer than three stations nothing else tells that the mounting has changed, and what knocks the IMU may crash its computer.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, NamedTuple
+
+from pydantic import TypeAdapter, ValidationError
+
+from tsgt.recording.files import write_atomically
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tsgt.model import ImuParameters
+
+IMU_SHOCKS_FILE = "imu_shocks.json"
+"""Beside the recordings."""
+
+
+class _ImuShocks(NamedTuple):
+    shocks: int
+    position_m: tuple[float, float, float]  # These two identify the mounting
+    orientation_xyzw: tuple[float, float, float, float]
+
+
+_ADAPTER = TypeAdapter(_ImuShocks)
+
+
+def read_imu_shocks(directory: Path, imu: ImuParameters) -> int:
+    """Return the number of shocks with this mounting; 0 where there is no such file, or it is of another mounting."""
+    try:
+        found = _ADAPTER.validate_json((directory / IMU_SHOCKS_FILE).read_bytes())
+    except (OSError, ValidationError):
+        return 0
+    return found.shocks if found[1:] == (imu.position_m, imu.orientation_xyzw) else 0
+
+
+def write_imu_shocks(directory: Path, imu: ImuParameters, shocks: int) -> None:
+    """Replace the number of shocks with this mounting. Raises OutputFileError if the file cannot be written."""
+    with write_atomically(directory / IMU_SHOCKS_FILE) as file:
+        file.write(_ADAPTER.dump_json(_ImuShocks(shocks, imu.position_m, imu.orientation_xyzw)))
+
+
+def forget_imu_shocks(directory: Path) -> None:
+    """Remove the file: the operator has stopped the master. What cannot be removed remains in force."""
+    with suppress(OSError):
+        (directory / IMU_SHOCKS_FILE).unlink()

@@ -6,9 +6,9 @@ With fewer than three stations nothing else tells that the mounting has changed,
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from tsgt.recording.files import write_atomically
 
@@ -22,7 +22,7 @@ IMU_SHOCKS_FILE = "imu_shocks.json"
 
 
 class _ImuShocks(NamedTuple):
-    shocks: int
+    shocks: Annotated[int, Field(ge=0, le=10**9)]
     position_m: tuple[float, float, float]  # These two identify the mounting
     orientation_xyzw: tuple[float, float, float, float]
 

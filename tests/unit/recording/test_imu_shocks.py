@@ -29,9 +29,16 @@ def test_shocks_are_those_of_a_mounting(tmp_path: Path) -> None:
     assert read_imu_shocks(tmp_path, IMU_PARAMETERS) == 0
 
 
-def test_damaged_file_tells_of_no_shock(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", [b'{"shocks":', b"[1, 2]", b"\xff"])
+def test_damaged_file_tells_of_no_shock(tmp_path: Path, damage: bytes) -> None:
     """The master starts without it."""
-    (tmp_path / IMU_SHOCKS_FILE).write_bytes(b'{"shocks":')
+    (tmp_path / IMU_SHOCKS_FILE).write_bytes(damage)
+    assert read_imu_shocks(tmp_path, IMU_PARAMETERS) == 0
+
+
+def test_impossible_number_tells_of_no_shock(tmp_path: Path) -> None:
+    """It would be refused as a parameter."""
+    write_imu_shocks(tmp_path, IMU_PARAMETERS, -3)
     assert read_imu_shocks(tmp_path, IMU_PARAMETERS) == 0
 
 

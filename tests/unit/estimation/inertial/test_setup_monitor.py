@@ -133,7 +133,7 @@ def test_setup_that_becomes_wrong_without_a_shock_may_be_a_tripod(*, is_shock: b
 
 
 @pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
-def test_few_prisms_do_not_confirm_after_a_blow(prisms: int, *, confirmed: bool) -> None:
+def test_few_prisms_do_not_confirm_after_a_knock(prisms: int, *, confirmed: bool) -> None:
     """A drive does not show them all rotations by which the shock may have turned the IMU."""
     monitored = Monitored([RIGHT, RIGHT], prisms=prisms)
     monitored.run(22)
@@ -144,7 +144,7 @@ def test_few_prisms_do_not_confirm_after_a_blow(prisms: int, *, confirmed: bool)
 
 
 @pytest.mark.parametrize(("prisms", "confirmed"), [(3, True), (2, False), (1, False)])
-def test_few_prisms_do_not_confirm_after_a_blow_before_them(prisms: int, *, confirmed: bool) -> None:
+def test_few_prisms_do_not_confirm_after_a_knock_before_them(prisms: int, *, confirmed: bool) -> None:
     """No measurement has come yet, so that no trajectory knows of the shock."""
     monitored = Monitored([RIGHT], prisms=prisms)
     monitored.monitor.samples(replace(shock(monitored.samples), received_ns=START - 10 * SECOND))

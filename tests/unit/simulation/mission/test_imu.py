@@ -18,7 +18,7 @@ from tsgt.estimation import centroid_at_point
 from tsgt.estimation.inertial import setup_monitor as imu_setup_monitor
 from tsgt.geometry import log_so3, rotation_from_quaternion, transform_from, transform_points
 from tsgt.geometry.inertial_calibration import SetupCheck
-from tsgt.recording import load_recording, read_imu_samples
+from tsgt.recording import load_recording, read_imu_samples, write_imu_shocks
 from tsgt.simulation.checks import check_invariants
 from tsgt.simulation.checks.devices import imu_failures
 from tsgt.simulation.checks.invariants import replay_mismatches
@@ -31,6 +31,7 @@ from tsgt.simulation.imu import (
     Silence,
     StuckValues,
 )
+from tsgt.simulation.mission import MASTER, MasterEdit
 from tsgt.simulation.scenario_files import with_stations
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.simulation.imu import DeviceSamples, ImuCondition
-    from tsgt.simulation.mission import MissionResult
+    from tsgt.simulation.mission import Mission, MissionResult
 
 PIPELINE = ScenarioConfig().pipeline.model_copy(update={"estimator": "linear"})
 WITHOUT = ScenarioConfig(pipeline=PIPELINE)
@@ -197,6 +198,26 @@ def test_poses_survive_a_fault_of_the_imu(drive: Drive, kind: str, monkeypatch: 
         # Nothing confirms the set-up anew here, as after a knock, and where the prisms noticed first that values were clipped.
         assert "used" not in uses[1:] if kind == "knock" else uses[-1] in ("used", "unconfirmed")
     assert live.valid[live.time_s > 6.0].mean() > 0.8
+
+
+@pytest.mark.slow
+def test_master_recalls_shocks_after_a_crash_alone(tmp_path: Path) -> None:
+    """Its recording says so, for a replay; a restart by the operator forgets them."""
+
+    async def crash_and_edit(mission: Mission) -> None:
+        await mission.sleep_until(4.0)
+        log = mission.master_logs[-1]
+        assert mission.parameters.imu is not None
+        write_imu_shocks(log.folder, mission.parameters.imu, 2)
+        await mission.crash(MASTER, down_s=0.5)
+        await mission.sleep_until(10.0)
+        await mission.edit_master(MasterEdit(pipeline={"rate_hz": 5.0}), 14.0)
+
+    scenario = with_stations(WITH.model_copy(update={"pipeline": ScenarioConfig().pipeline}), 1)
+    run = run_mission(tmp_path, scenario, script=crash_and_edit, duration_s=20.0, protocol=SUPERFRAME, seed=3)
+    recorded = [load_recording(path).parameters.imu for log in run.master_logs if (path := log.recording())]
+    assert [each and each.shocks_before for each in recorded] == [0, 2, 0, 0]
+    assert check_invariants(run) == []
 
 
 @pytest.mark.slow

@@ -68,7 +68,6 @@ def master(config_path: Path) -> None:
     from tsgt.master.reload import RELOAD_SIGNAL
     from tsgt.radio.from_config import lora_settings
     from tsgt.radio.legality import check_legality
-    from tsgt.recording import forget_imu_shocks
 
     signal.signal(RELOAD_SIGNAL, signal.SIG_IGN)  # one that comes early must not kill
     check_permissions(config_path)
@@ -86,11 +85,7 @@ def master(config_path: Path) -> None:
     clock = SystemClock()
     open_radio = radio_opener(config.radio, settings, clock)
     dependencies = MasterDependencies(open_radio=open_radio, clock=clock, key=key, read_setup=read_setup)
-    try:
-        service.run(lambda: run_through_suspensions(config, in_force, settings, dependencies))
-    except (KeyboardInterrupt, SystemExit):  # a stop by the operator, who knows of it
-        forget_imu_shocks(config.recording.directory)
-        raise
+    service.run(lambda: run_through_suspensions(config, in_force, settings, dependencies))
 
 
 def main_client() -> NoReturn:

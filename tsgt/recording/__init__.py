@@ -17,7 +17,7 @@ from tsgt.recording.format import (
     decode_line,
     encode_line,
 )
-from tsgt.recording.imu_shocks import IMU_SHOCKS_FILE, forget_imu_shocks, read_imu_shocks, write_imu_shocks
+from tsgt.recording.imu_shocks import IMU_SHOCKS_FILE, read_imu_shocks, write_imu_shocks
 from tsgt.recording.merged import MergedRecord
 from tsgt.recording.reader import (
     Recording,
@@ -91,7 +91,6 @@ __all__ = [
     "decode",
     "decode_line",
     "encode_line",
-    "forget_imu_shocks",
     "load_recording",
     "new_recording_path",
     "read_imu_samples",

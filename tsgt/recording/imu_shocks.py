@@ -1,11 +1,11 @@
-"""Shocks that may have displaced the IMU: a file beside the recordings, for a master that starts after a crash.
+"""Shocks that may have displaced the IMU: a file beside the recordings, for a master that starts later.
 
 With fewer than three stations nothing else tells that the mounting has changed, and what knocks the IMU may crash its computer.
+The file is in force until the IMU is calibrated anew, or the operator, who has looked at the bracket, removes it.
 """
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 from pydantic import Field, TypeAdapter, ValidationError
@@ -43,9 +43,3 @@ def write_imu_shocks(directory: Path, imu: ImuParameters, shocks: int) -> None:
     """Replace the number of shocks with this mounting. Raises OutputFileError if the file cannot be written."""
     with write_atomically(directory / IMU_SHOCKS_FILE) as file:
         file.write(_ADAPTER.dump_json(_ImuShocks(shocks, imu.position_m, imu.orientation_xyzw)))
-
-
-def forget_imu_shocks(directory: Path) -> None:
-    """Remove the file: the operator has stopped the master. What cannot be removed remains in force."""
-    with suppress(OSError):
-        (directory / IMU_SHOCKS_FILE).unlink()

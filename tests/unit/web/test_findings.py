@@ -105,7 +105,9 @@ def test_new_set_up_ends_a_wrong_one_of_the_imu() -> None:
     imu = replace(IMU_STATUS, age_s=0.01, problem="", use="unconfirmed", disagreement="not confirmed yet")
     feed(state, status(3.0, imu=imu), pose(3.0), now_s=3.0)
     view = state.view(3.0)
-    assert view["verdict"]["cause"].endswith("not confirmed yet: drive curves, accelerate and brake")
+    assert view["verdict"]["cause"].endswith(
+        "drive curves, accelerate and brake; after a knock check its bracket"
+    )
     assert view["alarms"] == []
 
 

@@ -153,7 +153,7 @@ def test_unconfirmed_imu_is_a_finding() -> None:
     feed(state, status(10.0, imu=imu), pose(10.0), now_s=10.0)
     assert verdict(state, 10.1) == (
         "CARE",
-        "the set-up of the IMU is not confirmed yet: drive curves, accelerate and brake",
+        "the set-up of the IMU is not confirmed: drive curves, accelerate and brake; after a knock check its bracket",
     )
 
 

@@ -1,4 +1,4 @@
-"""Keeps the number of shocks of the IMU for a master that starts after a crash."""
+"""Keeps the number of shocks of the IMU for a master that starts later."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 import structlog
 
 from tsgt.errors import OutputFileError
-from tsgt.recording import read_imu_shocks, write_imu_shocks
+from tsgt.recording import IMU_SHOCKS_FILE, read_imu_shocks, write_imu_shocks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,7 +41,11 @@ class ShockMemory:
             imu.position_m,
             imu.orientation_xyzw,
         )
-        self._shocks = self._shocks if same else read_imu_shocks(self._directory, imu)
+        if not same:
+            self._shocks = read_imu_shocks(self._directory, imu)
+            if self._shocks:
+                path = self._directory / IMU_SHOCKS_FILE
+                log.warning("imu_shocks_recalled", shocks=self._shocks, path=str(path))
         return replace(parameters, imu=replace(imu, shocks_before=self._shocks))
 
     def note(self, shocks: int) -> None:

@@ -32,6 +32,7 @@ from tsgt.simulation.checks.poses import (
     scale_failures,
     twist_failures,
 )
+from tsgt.simulation.checks.readings import readings_by_start
 from tsgt.simulation.checks.recorded_lines import lost_lines, recording_failures, size_failures
 from tsgt.simulation.checks.setup_lines import beacon_failures, parameter_failures, setup_failures
 from tsgt.simulation.checks.station_events import event_failures
@@ -53,8 +54,6 @@ _ANGLE_ROUNDING_RAD = math.tau / 2**25 * 1.001
 _DISTANCE_ROUNDING_M = 0.0501e-3
 # Above the latency of any station, which is subtracted from the timestamps.
 _MAX_LATENCY_NS = 5_000_000_000
-# GeoCOM sends ten decimals or more.
-_LINE_ROUNDING = 1e-9
 # Spread of response times, which limits the first timestamps.
 _MAX_TIMESTAMP_ERROR_NS = 40_000_000
 # The fastest response, which the configuration subtracts.
@@ -182,17 +181,10 @@ def reading_mismatches(station_log: StationLog, journal_index: JournalIndex) -> 
     """Compare the distances in a station's journals with those that its instrument reported."""
     seen: set[ReportedDistance] = set()
     errors_ns: list[int] = []  # of clients that know how fast the instrument usually responds
-    by_time_ms: dict[int, list[ReportedDistance]] = {}
-    for each in station_log.reported_distances:
-        by_time_ms.setdefault(each.instrument_ms, []).append(each)
-    for measurements in journal_index.journalled_by_start:
+    for readings in readings_by_start(journal_index):
         previous: ReportedDistance | None = None
         slowed_by = 1.0  # when the client began to fit the instrument's clock
-        for journalled in measurements:
-            if journalled.slope_distance_m is None or journalled.instrument_time_ns is None:
-                continue
-            candidates = by_time_ms.get(journalled.instrument_time_ns // 1_000_000, [])
-            truth = next((each for each in candidates if _matches(each, journalled)), None)
+        for journalled, truth in readings:
             if truth is None:
                 yield Violation(
                     "reading",
@@ -231,15 +223,6 @@ def _timestamp_limit_ns(slowed_by: float) -> float:
     Nothing tells it that the fastest of them is late, see docs/explanation/instrument-time.md.
     """
     return slowed_by * _MAX_TIMESTAMP_ERROR_NS + (slowed_by - 1.0) * _FASTEST_RESPONSE_NS
-
-
-def _matches(reported: ReportedDistance, journalled: PolarMeasurement) -> bool:
-    pairs = (
-        (reported.horizontal_angle_rad, journalled.horizontal_angle_rad),
-        (reported.zenith_angle_rad, journalled.zenith_angle_rad),
-        (reported.distance_m, journalled.slope_distance_m),
-    )
-    return all(value is not None and abs(given - value) < _LINE_ROUNDING for given, value in pairs)
 
 
 def recorded_sequences(master_logs: Sequence[MasterLog]) -> set[tuple[int, int]]:

@@ -10,6 +10,7 @@ from tsgt.estimation import usable
 from tsgt.model import MIN_PRISMS
 from tsgt.simulation.checks.poses import apparent_poses
 from tsgt.simulation.checks.poses.late_stamps import stamps_are_late
+from tsgt.simulation.checks.readings import median_stamp_error_s
 from tsgt.simulation.faults import FaultKind
 
 if TYPE_CHECKING:
@@ -42,6 +43,11 @@ MAX_MISFIT_M = 0.002
 
 CONTRADICTION_S, SETUP_CHECK_S = 5.0, 50.0
 """Measurements of these times before the events ``station_contradicted`` and ``imu_setup_wrong`` are looked at for their cause."""
+
+MIN_LATE_S = 0.004
+"""Stamps of a station that are later may contradict the IMU: so much is named as a wrong latency. A client takes an instrument that slows
+down gradually for one whose clock is slow (docs/explanation/instrument-time.md).
+"""
 
 
 def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]) -> Iterator[str]:
@@ -125,7 +131,8 @@ def contradicted_by_station(
             and at_s - before_s <= (m.stamp_ns - master_log.unix_at_zero_ns) / 1e9 <= at_s
             for m in master_log.measurements
         )
-        return stamps_are_late(indices.values(), at_s) or any(others) or any(renumbered)
+        late = (median_stamp_error_s(index, at_s - before_s, at_s) > MIN_LATE_S for index in indices.values())
+        return stamps_are_late(indices.values(), at_s) or any(late) or any(others) or any(renumbered)
 
     setup_wrong = False
     for event in master_log.events:

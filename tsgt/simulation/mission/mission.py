@@ -259,7 +259,7 @@ class Mission:
         before = self.master_logs[-1] if self.master_logs else None
         master_log = self._new_master_log(f"master{len(self.master_logs)}", self.clock)
         master_log.folder.mkdir()
-        if before is not None and (before.crashed or suspended is not None):  # not stopped by an operator
+        if before is not None:  # all have the same folder in the field
             with suppress(FileNotFoundError):
                 shutil.copy(before.folder / IMU_SHOCKS_FILE, master_log.folder)
         self.master_logs.append(master_log)

@@ -71,7 +71,7 @@ STATUS_AGE_LIMIT_S = 3.0
 FENCE_HYSTERESIS_M = 0.1
 """A robot that is parked at a fence does not change the verdict by the noise of its poses."""
 
-UNCONFIRMED = "the set-up of the IMU is not confirmed yet: drive curves, accelerate and brake"
+UNCONFIRMED = "the set-up of the IMU is not confirmed: drive curves, accelerate and brake; after a knock check its bracket"
 """The operator has to act: without that poses do without the IMU, or rest on one that may be set up wrongly."""
 
 DISK_FULL = "the disk is full"

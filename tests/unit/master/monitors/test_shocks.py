@@ -1,4 +1,4 @@
-"""Shocks of the IMU are kept for a master that starts after a crash."""
+"""Shocks of the IMU are kept for a master that starts later."""
 
 from __future__ import annotations
 

@@ -16,13 +16,23 @@ STATUSES = 12
 
 
 @pytest.mark.parametrize(
-    ("error_radps", "use", "valid_poses", "failures"),
-    [(0.02, "used", 5, 1), (0.02, "used", 0, 0), (0.02, "unconfirmed", 5, 0), (0.005, "used", 5, 0)],
+    ("true_radps", "stated_radps", "use", "valid_poses", "failures"),
+    [
+        (0.0, 0.02, "used", 5, 1),
+        (0.0, 0.02, "used", 0, 0),
+        (0.0, 0.02, "unconfirmed", 5, 0),
+        (0.0, 0.005, "used", 5, 0),
+        (0.03, 0.015, "used", 5, 0),
+        (0.03, 0.0, "used", 5, 1),
+        (0.009, -0.009, "used", 5, 1),
+    ],
 )
-def test_stated_gyro_bias(error_radps: float, use: str, valid_poses: int, failures: int) -> None:
+def test_stated_gyro_bias(
+    true_radps: float, stated_radps: float, use: str, valid_poses: int, failures: int
+) -> None:
     """It is wrong if it is far from the true one while valid poses rest on the IMU; before, it need not be known."""
     status = SimpleNamespace(
-        stamp_ns=0, imu=SimpleNamespace(use=use, gyro_bias_radps=(error_radps, 0.0, 0.0))
+        stamp_ns=0, imu=SimpleNamespace(use=use, gyro_bias_radps=(stated_radps, 0.0, 0.0))
     )
     counts = [PublishedCounts(0, 10 * n, valid_poses * n) for n in range(1, STATUSES + 1)]
     log = SimpleNamespace(
@@ -33,7 +43,7 @@ def test_stated_gyro_bias(error_radps: float, use: str, valid_poses: int, failur
         events=[],
         unix_at_zero_ns=0,
     )
-    truth = SimpleNamespace(gyro_bias_radps=np.zeros((1, 3)))
+    truth = SimpleNamespace(gyro_bias_radps=np.array([[true_radps, 0.0, 0.0]]))
     imu = SimpleNamespace(truth=truth, samples=SimpleNamespace(arrival_s=np.arange(0.0, 20.0, 0.025)))
     result: Any = SimpleNamespace(master_logs=[log], imu=imu)
     assert len(list(imu_status_failures(result))) == failures

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from harness.files.records import HEADER, measurement
 
+from tsgt.recording import encode_line
+from tsgt.recording.journal import JournalRecord
 from tsgt.simulation.checks.liveness import contradicted_by_station, follows_another, pose_share
 from tsgt.simulation.instrument.model import ReportedDistance
-from tsgt.simulation.mission import StationLog
+from tsgt.simulation.mission import JournalIndex, StationLog
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 def test_poses_are_expected_unless_a_needed_imu_is_knocked_or_contradicted() -> None:
@@ -55,6 +62,38 @@ def test_event_that_a_station_on_another_prism_has_caused_is_known(
         measurements=[],
     )
     index: Any = SimpleNamespace(station_log=log, journalled_by_start=[])
+    assert contradicted_by_station(result, master_log, {1: index}, 90.0) is expected
+
+
+@pytest.mark.parametrize(
+    ("late_ms", "at_s", "expected"), [(8, 50, True), (8, 70, False), (3, 50, False), (-8, 50, False)]
+)
+def test_event_that_late_stamps_have_caused_is_known(
+    tmp_path: Path, late_ms: int, at_s: int, *, expected: bool
+) -> None:
+    """Those of a client whose instrument slows down gradually, here by one measurement at 10 s."""
+    taken = replace(measurement(0), instrument_time_ns=10_000_000_000)
+    assert taken.slope_distance_m is not None
+    assert taken.host_time_ns is not None
+    reported = ReportedDistance(
+        10_000,
+        10_000_000_000,
+        taken.horizontal_angle_rad,
+        taken.zenith_angle_rad,
+        taken.slope_distance_m,
+        1,
+        0,
+    )
+    head = JournalRecord(station=1, unix_at_zero_ns=0, boot="boot", first_sequence=0)
+    (tmp_path / "1.jsonl").write_bytes(b"".join(encode_line(each) + b"\n" for each in (HEADER, head, taken)))
+    stamps_ns = {taken.host_time_ns: reported.true_ns + late_ms * 1_000_000}
+    result: Any = SimpleNamespace(parameters=SimpleNamespace(stations=[SimpleNamespace(station=1, prism=1)]))
+    master_log: Any = SimpleNamespace(
+        unix_at_zero_ns=5,
+        events=[SimpleNamespace(event="imu_setup_wrong", stamp_ns=5 + at_s * 1_000_000_000)],
+        measurements=[],
+    )
+    index = JournalIndex(StationLog(1, tmp_path, [reported], stamps_ns))
     assert contradicted_by_station(result, master_log, {1: index}, 90.0) is expected
 
 

@@ -201,8 +201,8 @@ def test_poses_survive_a_fault_of_the_imu(drive: Drive, kind: str, monkeypatch: 
 
 
 @pytest.mark.slow
-def test_master_recalls_shocks_after_a_crash_alone(tmp_path: Path) -> None:
-    """Its recording says so, for a replay; a restart by the operator forgets them."""
+def test_master_recalls_shocks_of_those_before(tmp_path: Path) -> None:
+    """After a crash as after a restart by the operator; its recording says so, for a replay."""
 
     async def crash_and_edit(mission: Mission) -> None:
         await mission.sleep_until(4.0)
@@ -216,7 +216,7 @@ def test_master_recalls_shocks_after_a_crash_alone(tmp_path: Path) -> None:
     scenario = with_stations(WITH.model_copy(update={"pipeline": ScenarioConfig().pipeline}), 1)
     run = run_mission(tmp_path, scenario, script=crash_and_edit, duration_s=20.0, protocol=SUPERFRAME, seed=3)
     recorded = [load_recording(path).parameters.imu for log in run.master_logs if (path := log.recording())]
-    assert [each and each.shocks_before for each in recorded] == [0, 2, 0, 0]
+    assert [each and each.shocks_before for each in recorded] == [0, 2, 2, 2]
     assert check_invariants(run) == []
 
 

@@ -37,8 +37,7 @@ def untold_displacements(
 
     A single prism tells no rotation of the IMU on the robot, and two none about their line: the poses are turned by it
     (docs/how-to/one-or-two-stations.md). A displacement is named from 50 mm on. A master knows of a knock by the shock that its samples
-    show, or those of a master before it that crashed, and allows for it in the covariance. One that was started by an operator later, or
-    had no samples of it, does not.
+    show, or those of a master before it, and allows for it in the covariance. Where no master had samples of it, none does.
     """
     at_s = (poses.stamp_ns - master_log.unix_at_zero_ns) / 1e9
     count = np.zeros(len(at_s))

@@ -2,6 +2,7 @@
 
 For each recording and prior, sigmas and noise scale are tuned on the same segments. The table has the log evidence relative to
 white noise on acceleration, and held-out prediction errors (folds as in `tsgt evaluate`; the prior is tuned without them).
+Measurements at rest are left out: what is assumed there does not follow from the sigmas, but depends on the correlation time.
 
     python benchmarks/run.py motion_prior RECORDING...
 """
@@ -25,6 +26,7 @@ from tsgt.analysis.evaluation.held_out import FOLDS
 from tsgt.estimation import build_observations
 from tsgt.geometry.batch import fit_trajectory
 from tsgt.geometry.batch.hyperparameters import log_parameters, maximise_evidence
+from tsgt.geometry.rest import find_rest, in_rest
 from tsgt.model import MotionPrior
 from tsgt.recording import load_recording
 
@@ -95,6 +97,7 @@ def main() -> None:
         observations, _ = build_observations(
             recording.parameters, recording.measurements, origin_ns=origin_ns
         )
+        observations = observations.select(in_rest(find_rest(observations), observations.time_s) < 0)
         print(f"{path}: {len(observations)} measurements, {np.ptp(observations.time_s):.0f} s")
         print(f"  {'prior':20} {'evidence':>9} {'mean mm':>8} {'p95 mm':>8}  tuned")
         least = np.nan

@@ -63,7 +63,8 @@ def with_layout(parameters: Parameters, layout: PrismLayout, *, path: Path) -> P
 def with_imu_mounting(parameters: Parameters, mounting: ImuMounting, *, path: Path) -> Parameters:
     """Replace mounting, latency and gyro matrix of the IMU and their covariance by those of a set-up file.
 
-    A recording without an IMU gets that of the file. Raises ConfigError if the file does not describe it completely.
+    Shocks before the recording say nothing of another mounting. A recording without an IMU gets that of the file. Raises ConfigError if
+    the file does not describe it completely.
     """
     imu = mounting.parameters() if parameters.imu is None else mounting.applied(parameters.imu)
     if imu is None:
@@ -71,6 +72,12 @@ def with_imu_mounting(parameters: Parameters, mounting: ImuMounting, *, path: Pa
             f"{path}: needs noise and gravity_mps2, because the recording has no IMU; `tsgt calibrate imu` writes them",
             path=path,
         )
+    before = parameters.imu
+    if before is not None and (before.position_m, before.orientation_xyzw) != (
+        imu.position_m,
+        imu.orientation_xyzw,
+    ):
+        imu = dataclasses.replace(imu, shocks_before=0)
     known = parameters.setup_covariance
     return dataclasses.replace(
         parameters, imu=imu, setup_covariance=_covariance(parameters, known, known, mounting.covariance)

@@ -20,7 +20,9 @@ _BASELINE = 1000  # samples after which the period is known to 1e-5 and better
 
 _GAP_TOLERANCE_NS = 2e6
 _GAP_TOLERANCE = 1e-4
-"""By how much the clock may disagree with the counter over a gap, plus this share of it; beyond, it was set meanwhile."""
+"""By how much the clock may disagree with the counter over a gap, plus this share of it; beyond, it was set meanwhile. After fewer samples
+the share grows with the square of what is missing: whole milliseconds tell the period of 50 samples to half a percent.
+"""
 
 _MAX_STEPS = 1e7  # a count that is further ahead is not a gap of samples
 
@@ -117,11 +119,12 @@ class SampleTimes:
         if counter is None or time_ns is None or before is None or time_before_ns is None or origin is None:
             return False
         count = before - origin[0]
-        if count < _BASELINE:
+        if count < 1:
             return False
+        share = _GAP_TOLERANCE * max(1.0, _BASELINE / count) ** 2
         expected_ns = (counter - before) * (time_before_ns - origin[1]) / count
         error_ns = abs(time_ns - time_before_ns - expected_ns)
-        return error_ns > _GAP_TOLERANCE_NS + _GAP_TOLERANCE * expected_ns
+        return error_ns > _GAP_TOLERANCE_NS + share * expected_ns
 
 
 def _not_after(sample: tuple[int | None, int | None], last: tuple[int | None, int | None]) -> bool:

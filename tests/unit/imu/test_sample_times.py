@@ -74,6 +74,21 @@ def test_clock_set_in_a_gap(step_ns: int, restarted: bool) -> None:  # noqa: FBT
     assert found.lost == (0 if restarted else 2800)
 
 
+@pytest.mark.parametrize(
+    ("samples", "step_ns", "restarted"),
+    [(700, 0, False), (700, -1_980 * MS, True), (50, 0, False), (50, -1_980 * MS, True), (5, 0, False)],
+)
+def test_clock_set_in_a_gap_soon_after_the_start(samples: int, step_ns: int, *, restarted: bool) -> None:
+    """Few samples tell their period well enough for a large step, with times in whole milliseconds too."""
+    times = SampleTimes(200.0)
+    for counter in range(samples):
+        times.push(counter, counter * 5_050_000 // MS * MS)
+    after = samples + 1700
+    found = times.push(after, (after * 5_050_000 + step_ns) // MS * MS)
+    assert found is not None
+    assert found.restarted == restarted
+
+
 def test_repeated_sample_is_none() -> None:
     """The same counter and time."""
     assert pushed((1, 5 * MS), (1, 5 * MS)) == [None]

@@ -72,11 +72,7 @@ def with_imu_mounting(parameters: Parameters, mounting: ImuMounting, *, path: Pa
             f"{path}: needs noise and gravity_mps2, because the recording has no IMU; `tsgt calibrate imu` writes them",
             path=path,
         )
-    before = parameters.imu
-    if before is not None and (before.position_m, before.orientation_xyzw) != (
-        imu.position_m,
-        imu.orientation_xyzw,
-    ):
+    if parameters.imu is not None and parameters.imu.mounting != imu.mounting:
         imu = dataclasses.replace(imu, shocks_before=0)
     known = parameters.setup_covariance
     return dataclasses.replace(

@@ -128,6 +128,11 @@ class ImuParameters(FiniteNumbers):
             raise ValueError(f"orientation_xyzw holds {self.orientation_xyzw}, expected a unit quaternion")
 
     @property
+    def mounting(self) -> tuple[Vector3, Row4]:
+        """Position and orientation: what a knock changes, and a calibration determines anew."""
+        return self.position_m, self.orientation_xyzw
+
+    @property
     def point(self) -> ReferencePoint:
         """Its frame as a point of the robot whose pose may be exported."""
         return ReferencePoint(

@@ -36,10 +36,10 @@ def read_imu_shocks(directory: Path, imu: ImuParameters) -> int:
         found = _ADAPTER.validate_json((directory / IMU_SHOCKS_FILE).read_bytes())
     except (OSError, ValidationError):
         return 0
-    return found.shocks if found[1:] == (imu.position_m, imu.orientation_xyzw) else 0
+    return found.shocks if found[1:] == imu.mounting else 0
 
 
 def write_imu_shocks(directory: Path, imu: ImuParameters, shocks: int) -> None:
     """Replace the number of shocks with this mounting. Raises OutputFileError if the file cannot be written."""
     with write_atomically(directory / IMU_SHOCKS_FILE) as file:
-        file.write(_ADAPTER.dump_json(_ImuShocks(shocks, imu.position_m, imu.orientation_xyzw)))
+        file.write(_ADAPTER.dump_json(_ImuShocks(shocks, *imu.mounting)))

@@ -37,11 +37,7 @@ class ShockMemory:
         self._imu = imu
         if imu is None:
             return parameters
-        same = before is not None and (before.position_m, before.orientation_xyzw) == (
-            imu.position_m,
-            imu.orientation_xyzw,
-        )
-        if not same:
+        if before is None or before.mounting != imu.mounting:
             self._shocks = read_imu_shocks(self._directory, imu)
             if self._shocks:
                 path = self._directory / IMU_SHOCKS_FILE

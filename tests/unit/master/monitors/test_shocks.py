@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from harness.files.records import IMU_PARAMETERS, PARAMETERS
+from structlog.testing import capture_logs
 
 from tsgt.master.monitors import ShockMemory
 from tsgt.recording import read_imu_shocks
@@ -38,7 +39,9 @@ async def test_next_master_recalls_the_shocks(tmp_path: Path) -> None:
     memory.note(2)
     assert shocks_before(memory.recall(WITH_IMU)) == 2
     await _run_for(memory, 0.1)
-    assert shocks_before(ShockMemory(tmp_path).recall(WITH_IMU)) == 2
+    with capture_logs() as logs:
+        assert shocks_before(ShockMemory(tmp_path).recall(WITH_IMU)) == 2
+    assert [(each["event"], each["shocks"]) for each in logs] == [("imu_shocks_recalled", 2)]
     moved = replace(WITH_IMU, imu=replace(IMU_PARAMETERS, position_m=(0.0, 0.0, 0.9)))
     assert shocks_before(memory.recall(moved)) == 0
     assert memory.recall(PARAMETERS) == PARAMETERS

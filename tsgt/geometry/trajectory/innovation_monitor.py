@@ -154,7 +154,7 @@ class InnovationMonitor:
     ) -> None:
         """Process the N new of the window's M measurements (``is_new``); ``outliers``, (M,), are of the updated trajectory.
 
-        ``new_nis``: (N,) of the new ones. ``residuals_m``: (M, 3) of the updated trajectory. ``certain``: (N,) whether the rotation was
+        ``new_nis``: (N,) of the new ones. ``residuals_m``: (M, 3) of the updated trajectory. ``certain``: (N,) whether the state was
         certain enough that a linear prediction tells what chance gives; None: it was.
         """
         flagged = np.zeros(len(observations), np.bool_)

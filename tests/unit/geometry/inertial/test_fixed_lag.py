@@ -600,3 +600,19 @@ def test_innovations_are_no_evidence_where_missing_samples_lose_the_rotation(*, 
     assert live.window.converged
     assert live.window.ambiguous
     assert live.window.beyond_chance is not missing
+
+
+def test_innovations_are_no_evidence_after_an_outage_that_leaves_the_position_uncertain() -> None:
+    """The position is uncertain by metres and the rotation by 30 mrad: the prediction of what comes together is not linear."""
+    imu, drive = imu_parameters("consumer"), inertial_drive(28.0, seed=7)
+    samples, observations = drive.samples(imu, seed=7), drive.measure(stations=2, seed=7)
+    observations = replace(observations, layout=observations.layout[:2] - CENTROID)
+    time_s, is_second = observations.time_s, observations.prism == 1
+    live = Live(imu=imu)
+    live.measure(observations.select((time_s < 3.0) | ((time_s > 11.0) & (time_s < 12.0) & is_second)), samples)
+    live.sample_until(26.0, samples)
+    live.window.marginalise_before(23.0)
+    live.window.update(observations.select((time_s > 24.0) & (time_s < 26.0) & is_second))
+    assert live.window.converged
+    assert live.window.ambiguous
+    assert not live.window.beyond_chance

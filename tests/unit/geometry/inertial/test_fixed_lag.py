@@ -609,7 +609,9 @@ def test_innovations_are_no_evidence_after_an_outage_that_leaves_the_position_un
     observations = replace(observations, layout=observations.layout[:2] - CENTROID)
     time_s, is_second = observations.time_s, observations.prism == 1
     live = Live(imu=imu)
-    live.measure(observations.select((time_s < 3.0) | ((time_s > 11.0) & (time_s < 12.0) & is_second)), samples)
+    live.measure(
+        observations.select((time_s < 3.0) | ((time_s > 11.0) & (time_s < 12.0) & is_second)), samples
+    )
     live.sample_until(26.0, samples)
     live.window.marginalise_before(23.0)
     live.window.update(observations.select((time_s > 24.0) & (time_s < 26.0) & is_second))

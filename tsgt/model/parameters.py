@@ -69,6 +69,24 @@ class Parameters:
         """Whether the stations' frames and prisms, and the prisms' positions, are those of ``other``."""
         return self._set_up() == other._set_up()
 
+    def same_corrections(self, other: Parameters) -> bool:
+        """Whether also all that corrects measurements and samples is that of ``other``: constants, latencies, and the IMU's mounting."""
+        return self.same_set_up(other) and self._corrections() == other._corrections()
+
+    def _corrections(self) -> tuple[object, ...]:
+        stations = (
+            (
+                each.prism_constant_m,
+                each.atmospheric_ppm,
+                each.latency_ns,
+                each.vertical_index_rad,
+                each.collimation_rad,
+            )
+            for each in self.stations
+        )
+        imu = self.imu and (self.imu.mounting, self.imu.latency_ns, self.imu.gyro_matrix)
+        return *stations, imu, self.odometry
+
     def _set_up(self) -> tuple[object, ...]:
         stations = ((each.station, each.prism, each.T_station1_station) for each in self.stations)
         return *stations, *self.prisms

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import defaultdict
 from dataclasses import dataclass, field
 from statistics import median
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from tsgt.errors import CorruptLineError, RecordingError
 from tsgt.model import (
@@ -18,6 +19,7 @@ from tsgt.model import (
     PolarMeasurement,
 )
 from tsgt.recording.format import (
+    HEADER_START,
     MAX_LINE_BYTES,
     NO_HEADER,
     Line,
@@ -27,7 +29,7 @@ from tsgt.recording.format import (
     decode,
     decode_line,
 )
-from tsgt.recording.merged import MergedRecord
+from tsgt.recording.merged import MergedRecord, same_content
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -60,7 +62,7 @@ class Recording:
     header: RecordingHeader  # of the first run of the master
     parameters: Parameters  # the last ones in the file
     measurements: list[Measurement]
-    """In the order of arrival, merged ones at their place in the file; one that several runs recorded only once."""
+    """In the order of arrival, merged ones at their place in the file; one that several runs have only once."""
     end_ns: int | None
     """Latest arrival, status or event in the file, on the master's Unix clock in ns; None without any."""
     imu_samples: list[ImuSamples] = field(
@@ -70,12 +72,19 @@ class Recording:
     left_out: int = 0
     """Measurements before the set-up was replaced while the master ran: the last parameters need not apply to them."""
     set_ups_differ: bool = False
-    """Whether runs that were joined have other frames or prisms than the last, which is used for all of them."""
+    """Whether runs that were joined have another set-up than the last, which is used for all of them."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Stamped:
     stamp_ns: int
+
+
+class _Origin(NamedTuple):
+    """Where a measurement comes from: a run of the master, by its number in the file, and of that the radio or a journal."""
+
+    run: int
+    merged: bool
 
 
 def read_lines(
@@ -92,7 +101,7 @@ def read_lines(
     ``poses``: likewise the poses, most of the lines. Lines that are skipped are not checked, but for another line in them.
 
     ``keep_going``: skip lines that cannot be read instead of raising. ``on_problem``: called for each skipped line: a
-    torn last line always, others with ``keep_going``.
+    torn last line of a run always, others with ``keep_going``.
 
     Raises
     ------
@@ -109,27 +118,33 @@ def read_lines(
         # Where the end of a line was lost, a measurement may follow in the same one.
         if number > 1 and raw.startswith(skipped) and raw.endswith(b"}\n") and raw.find(_LINE_START, 1) < 0:
             continue
-        data = raw.removesuffix(b"\n") if raw.endswith(b"\n") else raw.rstrip(b"\0")
-        try:
-            kind = decode(Typed, data).type
-            if kind == "recording":
-                check_header(data, path, number)
-        except ValueError as error:
-            if number == 1 and not raw.strip(b"\0"):
-                raise RecordingError(
-                    "holds only zero bytes: a power cut came before its first line was on the disk", path=path
-                ) from error
-            if number == 1:
-                raise RecordingError(NO_HEADER, path=path) from error
-            problem = _unreadable(raw, str(error), path, number)
-            if not keep_going and isinstance(problem, CorruptLineError):
-                raise problem from error
-            if on_problem is not None:
-                on_problem(problem)
-            continue
-        if number == 1 and kind != "recording":
-            raise RecordingError(NO_HEADER, path=path)
-        yield Line(number, kind, data)
+        for piece in _divided(raw):
+            data = piece.removesuffix(b"\n") if piece.endswith(b"\n") else piece.rstrip(b"\0")
+            try:
+                kind = decode(Typed, data).type
+                if kind == "recording":
+                    check_header(data, path, number)
+            except ValueError as error:
+                if number == 1 and not piece.strip(b"\0"):
+                    raise RecordingError(
+                        "holds only zero bytes: a power cut came before its first line was on the disk",
+                        path=path,
+                    ) from error
+                if number == 1:
+                    raise RecordingError(NO_HEADER, path=path) from error
+                problem = _unreadable(piece, str(error), path, number)
+                if len(piece) < len(raw) and not piece.endswith(b"\n"):
+                    problem = RecordingError(
+                        "the last line of a run is torn and is skipped", path=path, line=number
+                    )
+                if not keep_going and isinstance(problem, CorruptLineError):
+                    raise problem from error
+                if on_problem is not None:
+                    on_problem(problem)
+                continue
+            if number == 1 and kind != "recording":
+                raise RecordingError(NO_HEADER, path=path)
+            yield Line(number, kind, data)
     if number == 0:
         raise RecordingError("is empty; it does not even have the header of a recording", path=path)
 
@@ -144,7 +159,7 @@ def load_recording(
 ) -> Recording:
     """Read measurements and parameters for post-processing.
 
-    Where the set-up was replaced while the master ran, what precedes the last set-up is left out: the tripods may have
+    Where the set-up was replaced by another while the master ran, what precedes the last set-up is left out: the tripods may have
     stood elsewhere. ``whole``: include it. ``imu``: also read the samples of the robot's IMU and wheel odometry. ``keep_going``, ``on_problem``: as for :func:`read_lines`; a line with missing or wrong fields counts as one that
     cannot be read. Raises RecordingError as :func:`read_lines`, without parameters in the file, and where
     angles or distances are in another unit.
@@ -152,7 +167,8 @@ def load_recording(
     header: RecordingHeader | None = None
     parameters: Parameters | None = None
     measurements: list[Measurement] = []
-    earlier_ns: dict[object, int] = {}  # stamps of the measurements of the runs before
+    origins: list[_Origin] = []  # of the measurements
+    run = 0
     imu_samples: list[ImuSamples] = []
     odometry: list[OdometrySamples] = []
     end_ns: int | None = None
@@ -165,26 +181,27 @@ def load_recording(
             match line.type:
                 case "recording":
                     header = header or decode_line(RecordingHeader, line, path)
-                    earlier_ns.update((_identity(each), each.stamp_ns) for each in measurements)
+                    run += 1
                     new_session = True
                 case "parameters":
                     previous, parameters = parameters, decode_line(Parameters, line, path)
-                    differs = previous is not None and not parameters.same_set_up(previous)
-                    set_ups_differ = new_session and (set_ups_differ or differs)
-                    replaced = not new_session and not whole
+                    differs = previous is not None and not parameters.same_corrections(previous)
+                    reloaded = not new_session and parameters != previous
+                    set_ups_differ = not reloaded and (set_ups_differ or differs)
+                    replaced = reloaded and not whole
                     if replaced:
                         left_out += len(measurements)
-                        for samples in (measurements, imu_samples, odometry):
+                        for samples in (measurements, origins, imu_samples, odometry):
                             samples.clear()
                     new_session = False
                 case "measurement" | "point":
                     measurement: Measurement = decode_line(_MEASUREMENTS[line.type], line, path)
-                    before_ns = earlier_ns.get(_identity(measurement)) if earlier_ns else None
-                    if before_ns is None or abs(measurement.stamp_ns - before_ns) > SAME_MEASUREMENT_NS:
-                        measurements.append(measurement)
+                    measurements.append(measurement)
+                    origins.append(_Origin(run, merged=False))
                     known_ns = measurement.received_ns
                 case "merged":
                     measurements.append(decode_line(MergedRecord, line, path).measurement)
+                    origins.append(_Origin(run, merged=True))
                     known_ns = measurements[-1].received_ns
                 case "setup" if replaced:
                     valid_from_ns, replaced = decode_line(_Stamped, line, path).stamp_ns, False
@@ -201,6 +218,8 @@ def load_recording(
                 on_problem(problem)
         if known_ns is not None:
             end_ns = known_ns if end_ns is None else max(end_ns, known_ns)
+    if run > 1:
+        measurements = _counted_once(measurements, origins)
     early = [each for each in measurements if each.stamp_ns < valid_from_ns]
     if early:
         measurements = [each for each in measurements if each.stamp_ns >= valid_from_ns]
@@ -238,28 +257,43 @@ def _check_units(measurements: list[Measurement], path: Path) -> None:
             )
 
 
-def _identity(measurement: Measurement) -> object:
-    """Return what a measurement has in common in the recordings of all masters that received it, but for its time."""
-    if isinstance(measurement, PointMeasurement):
-        return measurement
-    return (
-        measurement.station,
-        measurement.sequence,
-        measurement.horizontal_angle_rad,
-        measurement.zenith_angle_rad,
-        measurement.slope_distance_m,
-    )
+def _counted_once(measurements: list[Measurement], origins: list[_Origin]) -> list[Measurement]:
+    """Return measurements of several runs without those that another run has as well.
+
+    A master that is killed before it acknowledges a measurement has recorded it, and the next one records it again; a journal
+    may be merged into each run. Of one that was delivered and merged the delivered one is returned, otherwise the first.
+    """
+    kept: list[int] = []
+    earlier: defaultdict[object, list[int]] = defaultdict(list)
+    for row in sorted(range(len(measurements)), key=lambda row: origins[row].merged):
+        measurement = measurements[row]
+        is_polar = isinstance(measurement, PolarMeasurement)
+        others = earlier[(measurement.station, measurement.sequence) if is_polar else measurement]
+        if not any(
+            origins[other].run != origins[row].run and _is_same(measurement, measurements[other])
+            for other in others
+        ):
+            kept.append(row)
+            others.append(row)
+    return [measurements[row] for row in sorted(kept)]
+
+
+def _is_same(one: Measurement, other: Measurement) -> bool:
+    """Whether two measurements of different runs, of equal number, are the same one."""
+    if isinstance(one, PointMeasurement) or isinstance(other, PointMeasurement):
+        return one == other
+    return abs(one.stamp_ns - other.stamp_ns) <= SAME_MEASUREMENT_NS and same_content(one, other)
 
 
 def replaced_line(path: Path) -> int:
     """Return the number of the last line with parameters that replace others while the master runs; 0: there is none."""
-    found, begins = 0, False
-    with path.open("rb") as file:
-        for number, line in enumerate(file, start=1):
-            if line.startswith(b'{"type":"parameters"'):
-                found, begins = found if begins else number, False
-            elif line.startswith(b'{"type":"recording"'):
-                begins = True
+    found, begins, previous = 0, False, b""
+    for number, line in enumerate(_raw_lines(path), start=1):
+        if line.startswith(b'{"type":"parameters"'):
+            found = number if not begins and line != previous else found
+            begins, previous = False, line
+        elif HEADER_START in line:
+            begins = True
     return found
 
 
@@ -302,6 +336,12 @@ def _read_samples(
                 on_problem(problem)
         else:
             yield samples
+
+
+def _divided(raw: bytes) -> tuple[bytes, ...]:
+    """Return a line in two where a run that was joined begins in it, because the run before has lost the end of its last line."""
+    start = raw.find(HEADER_START, 1)
+    return (raw,) if start < 0 else (raw[:start], raw[start:])
 
 
 def _unreadable(raw: bytes, why: str, path: Path, line: int) -> RecordingError:

@@ -8,11 +8,13 @@ import pytest
 from harness.files.records import (
     EVENT,
     HEADER,
+    IMU_PARAMETERS,
     NO_POSE,
     PARAMETERS,
     POINT,
     POSE,
     SECOND,
+    SETUP,
     START,
     STATUS,
     imu_samples,
@@ -28,6 +30,7 @@ from tsgt.recording import (
     load_recording,
     read_imu_samples,
     read_lines,
+    replaced_line,
 )
 
 if TYPE_CHECKING:
@@ -316,8 +319,11 @@ def test_file_of_zeros_is_named(tmp_path: Path) -> None:
 
 def test_joined_runs_may_have_different_set_ups(path: Path) -> None:
     """The last one is used for all measurements, and the recording says so; of equal ones it does not."""
+    first, *others = PARAMETERS.stations
     moved = replace(PARAMETERS, stations=PARAMETERS.stations[:2])
-    for second, differ in ((PARAMETERS, False), (moved, True)):
+    late = replace(PARAMETERS, stations=(replace(first, latency_ns=1_000_000), *others))
+    equipped = replace(PARAMETERS, imu=IMU_PARAMETERS)
+    for second, differ in ((PARAMETERS, False), (moved, True), (late, True), (equipped, True)):
         joined = b"".join(encode_line(record) + b"\n" for record in (HEADER, second, measurement(1)))
         path.write_bytes(recording_bytes(measurement(0)) + joined)
         recording = load_recording(path)
@@ -334,6 +340,46 @@ def test_measurement_that_two_joined_runs_recorded_counts_once(path: Path) -> No
     joined = [HEADER, PARAMETERS, again, *others, much_later]
     path.write_bytes(recording_bytes(first) + b"".join(encode_line(record) + b"\n" for record in joined))
     assert load_recording(path).measurements == [first, *others, much_later]
+
+
+def test_measurement_that_was_merged_into_joined_runs_counts_once(path: Path) -> None:
+    """Journals are merged into the runs of a day one by one, and each takes what it has not received; the radio rounds."""
+    delivered = replace(measurement(5), host_time_ns=None, horizontal_angle_rad=0.8142857)
+    merged = MergedRecord(
+        journal="station1.jsonl",
+        measurement=replace(delivered, horizontal_angle_rad=0.81428571, stamp_ns=START),
+    )
+    again = replace(merged, measurement=replace(merged.measurement, stamp_ns=START + 80_000))
+    delivered = replace(delivered, stamp_ns=START + 10_000)
+    for runs, kept in (
+        (((merged,), (again,)), merged.measurement),
+        (((merged,), (delivered,), (again,)), delivered),
+        (((delivered,), (again,)), delivered),
+    ):
+        path.write_bytes(b"".join(recording_bytes(*records) for records in runs))
+        assert load_recording(path).measurements == [kept]
+
+
+def test_set_up_that_is_read_again_replaces_nothing(path: Path) -> None:
+    """Its files were the same; another set-up replaces it, so that what precedes is left out."""
+    moved = replace(PARAMETERS, stations=PARAMETERS.stations[::-1])
+    for second, left_out in ((PARAMETERS, 0), (moved, 1)):
+        path.write_bytes(recording_bytes(measurement(0), second, SETUP, measurement(9)))
+        recording = load_recording(path)
+        assert (len(recording.measurements), recording.left_out) == (2 - left_out, left_out)
+
+
+@pytest.mark.parametrize(("kept", "torn"), [(-1, 0), (-40, 1)])
+def test_run_after_one_that_was_cut_is_read(path: Path, kept: int, torn: int) -> None:
+    """Its header follows the torn last line of the run before, or one that lacks the line end alone."""
+    problems: list[RecordingError] = []
+    first = recording_bytes(measurement(0), measurement(1))
+    path.write_bytes(first[:kept] + recording_bytes(measurement(2)))
+    recording = load_recording(path, on_problem=problems.append)
+    assert [each.sequence for each in recording.measurements] == [[0, 1, 2], [0, 2]][torn]
+    assert recording.left_out == 0
+    assert ["the last line of a run is torn" in str(each) for each in problems] == [True] * torn
+    assert replaced_line(path) == 0
 
 
 def test_one_run_keeps_equal_measurements(path: Path) -> None:

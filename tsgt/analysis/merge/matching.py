@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
@@ -18,6 +17,7 @@ from tsgt.analysis.merge.timing import (
     times_from_beacons,
     times_from_synchronisations,
 )
+from tsgt.recording.merged import same_content
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -31,10 +31,6 @@ _ROUGH_NS = 5_000_000_000  # Accuracy of a delivered measurement without a times
 _EARLY_NS = 1_000_000_000  # A response this long before the journal's start may belong to it
 _DRIFT = 200e-6  # Upper limit of the frequency difference of two computers' clocks
 _AFTER_NS = 10_000_000_000  # Until then a synchronisation belongs to a journal without successor
-
-# Half a unit of the protocol plus rounding errors of the sums; distances from 1677.7 m on are sent in whole mm.
-_ANGLE_ROUNDING_RAD = math.tau / 2**25 * 1.001
-_DISTANCE_ROUNDING_M = 0.501e-3
 
 
 class IndexedJournal(NamedTuple):
@@ -226,19 +222,3 @@ def better(one: MasterTime | None, other: MasterTime | None) -> MasterTime | Non
     if one is None or other is None:
         return one or other
     return min(one, other, key=lambda time: time.bound_ns)
-
-
-def same_content(journalled: PolarMeasurement, delivered: PolarMeasurement) -> bool:
-    """Return whether a delivered measurement equals a journalled one up to the rounding of the protocol superframe."""
-    if (journalled.status, journalled.prism) != (delivered.status, delivered.prism):
-        return False
-    differences_rad = (
-        journalled.horizontal_angle_rad - delivered.horizontal_angle_rad,
-        journalled.zenith_angle_rad - delivered.zenith_angle_rad,
-    )
-    if any(abs(math.remainder(angle, math.tau)) > _ANGLE_ROUNDING_RAD for angle in differences_rad):
-        return False
-    journalled_m, delivered_m = journalled.slope_distance_m, delivered.slope_distance_m
-    if journalled_m is None or delivered_m is None:
-        return journalled_m is delivered_m
-    return abs(journalled_m - delivered_m) <= _DISTANCE_ROUNDING_M

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.evaluation import Reference
     from tsgt.analysis.processing import Estimator
     from tsgt.analysis.smoothing import SmoothedPoses
+    from tsgt.config import StationCalibration
     from tsgt.estimation import PoseBatch
     from tsgt.model import MotionPrior, Parameters, ReferencePoint
     from tsgt.recording import Recording
@@ -169,8 +170,7 @@ def load(
     )
     if frames is None or prisms is None:
         recording = calibrated(recording, path)
-    if point is not None:
-        point = resolved_point(point, recording.parameters)
+    recorded = recording.parameters
     if imu is not None:
         recording = imu.applied(recording, path, keep_going=keep_going)
     parameters = recording.parameters
@@ -185,17 +185,43 @@ def load(
         from tsgt.analysis.setup_replacement import with_calibration
         from tsgt.config import load_station_calibration
 
-        parameters = with_calibration(parameters, load_station_calibration(frames), path=frames)
+        calibration = load_station_calibration(frames)
+        _note_kept_corrections(parameters, calibration, frames)
+        parameters = with_calibration(parameters, calibration, path=frames)
     if prisms is not None:
         from tsgt.analysis.setup_replacement import with_layout
         from tsgt.config import load_prism_layout
 
         parameters = with_layout(parameters, load_prism_layout(prisms), path=prisms)
-    parameters = dataclasses.replace(parameters, no_poses=None)
-    if point is not None:
-        parameters = dataclasses.replace(parameters, reference_point=point)
+    point = _recorded_name(recorded) if point is None else point
+    parameters = dataclasses.replace(
+        parameters, no_poses=None, reference_point=resolved_point(point, parameters)
+    )
     recording = dataclasses.replace(recording, parameters=parameters)
     return recording if estimator is None else with_estimator(recording, estimator)
+
+
+def _recorded_name(recorded: Parameters) -> ReferencePoint | str:
+    """Return the recorded reference point, by its name where it moves with the set-up: the prisms' centroid and the IMU."""
+    from tsgt.estimation import centroid_point
+
+    point = recorded.reference_point
+    moving = [centroid_point(recorded)] if recorded.prisms else []
+    moving += [] if recorded.imu is None else [recorded.imu.point]
+    return point.name if point in moving else point
+
+
+def _note_kept_corrections(parameters: Parameters, calibration: StationCalibration, path: Path) -> None:
+    """Say that recorded latencies and distance scales stay: those of an earlier calibration may be among them."""
+    kept = []
+    for station in parameters.stations:
+        new = calibration.stations.get(station.station)
+        if new is not None and new.latency_ns is None and station.latency_ns:
+            kept.append(f"latency {station.latency_ns / 1e6:g} ms of station {station.station}")
+        if new is not None and new.range_scale_ppm is None and station.atmospheric_ppm:
+            kept.append(f"distance scale {station.atmospheric_ppm:g} ppm of station {station.station}")
+    if kept:
+        click.echo(f"note: {path} has no other value, so it stays as recorded: {', '.join(kept)}", err=True)
 
 
 def calibrated(recording: Recording, path: Path) -> Recording:

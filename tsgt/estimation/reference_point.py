@@ -68,7 +68,9 @@ def named_point(parameters: Parameters, name: str) -> ReferencePoint:
 
     Raises ValueError: there is none of this name.
     """
-    points = {ROBOT_FRAME: ROBOT_ORIGIN, "centroid": centroid_point(parameters)}
+    points = {ROBOT_FRAME: ROBOT_ORIGIN}
+    if parameters.prisms:
+        points["centroid"] = centroid_point(parameters)
     if parameters.imu is not None:
         points[parameters.imu.name] = parameters.imu.point
     points.setdefault(parameters.reference_point.name, parameters.reference_point)

@@ -6,7 +6,7 @@ import itertools
 import sys
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
@@ -42,7 +42,11 @@ if TYPE_CHECKING:
 
     from tsgt.recording import Kind, Recording
 
+T = TypeVar("T")
+
 STDOUT = Path("-")
+
+_WHY_INVALID = "--format csv tells why each pose is invalid"
 
 _FINAL = ("interpolated", "smoothed")
 
@@ -141,13 +145,19 @@ def export(
         require_extra("MCAP files", "mcap.writer", "rosbags.typesys", extra="mcap")
     if output != STDOUT:
         refuse_overwrite([recording, reference_path, imu.samples, imu.setup, imu.odometry], output)
-    point = _point(point, recording)
-    if format_name == "mcap":
+    loaded = None
+    if imu != ImuOptions():  # its mounting may be another one
+        _refuse_recorded(recording, series, keep_going=keep_going)
         loaded = load(recording, keep_going=keep_going, point=point, imu=imu)
+        point = loaded.parameters.reference_point
+    else:
+        point = _point(point, recording)
+    if format_name == "mcap":
+        loaded = loaded or load(recording, keep_going=keep_going, point=point, imu=imu)
         reference = load_reference(reference_path, reference_point, loaded.parameters)
         poses = _poses_of(recording, series, point, imu, keep_going=keep_going, loaded=loaded)
         with write_atomically(output) as file:
-            write_mcap(file, messages(loaded, poses, reference))
+            write_mcap(file, messages(loaded, _noting_none(poses, recording), reference))
         return
     lines: Iterable[str]
     if records == "measurements":
@@ -155,12 +165,38 @@ def export(
         raw = load_recording(recording, whole=True, keep_going=keep_going, on_problem=report_problem)
         lines = measurement_csv(raw.measurements)
     else:
-        poses = _poses_of(recording, series, point, imu, keep_going=keep_going, quiet=output == STDOUT)
-        lines = pose_csv(poses) if format_name == "csv" else tum_lines(valid_records(poses), point)
+        poses = _poses_of(
+            recording, series, point, imu, keep_going=keep_going, quiet=output == STDOUT, loaded=loaded
+        )
+        lines = (
+            pose_csv(poses)
+            if format_name == "csv"
+            else tum_lines(_not_none(valid_records(poses), recording), point)
+        )
     if output == STDOUT:
         sys.stdout.writelines(lines)
     else:
         write_lines(output, lines)
+
+
+def _not_none(valid: Iterable[T], path: Path) -> Iterator[T]:
+    """Yield what is in a list of valid poses; raises RecordingError if nothing is."""
+    poses = iter(valid)
+    first = next(poses, None)
+    if first is None:
+        raise RecordingError(f"has no valid pose; {_WHY_INVALID}", path=path)
+    yield first
+    yield from poses
+
+
+def _noting_none(poses: Iterable[PoseRecord], path: Path) -> Iterator[PoseRecord]:
+    """Yield poses; say so if none is valid: of those an MCAP file has only the prisms."""
+    some = False
+    for pose in poses:
+        some |= pose.valid
+        yield pose
+    if not some:
+        click.echo(f"note: {path} has no valid pose, only positions of prisms; {_WHY_INVALID}", err=True)
 
 
 def _point(point: ReferencePoint | str | None, path: Path) -> ReferencePoint:
@@ -178,6 +214,17 @@ def _point(point: ReferencePoint | str | None, path: Path) -> ReferencePoint:
     return ROBOT_ORIGIN
 
 
+def _refuse_recorded(path: Path, series: str | None, *, keep_going: bool) -> None:
+    """Raise UsageError for options of the IMU if there are poses."""
+    recorded = _recorded_poses(path, series, keep_going=keep_going, quiet=True, reported=False)
+    if next(recorded, None) is not None:
+        recorded.close()
+        raise click.UsageError(
+            f"{path} holds poses, which are exported as they are: options of the IMU have no effect; `tsgt process` computes "
+            "poses with them"
+        )
+
+
 def _poses_of(
     path: Path,
     series: str | None,
@@ -191,18 +238,12 @@ def _poses_of(
     """Return the poses of a recording, carried over to a point; if it has none, compute them.
 
     ``quiet`` suppresses the progress bar, which would mix with lines on the terminal. Problems of a recording that is
-    ``loaded`` have been reported already. Raises UsageError for options of the IMU if there are poses.
+    ``loaded`` have been reported already.
     """
     recorded = _recorded_poses(path, series, keep_going=keep_going, quiet=quiet, reported=loaded is not None)
     first = next(recorded, None)
     if first is None:
         return _computed(path, series, point, imu, keep_going=keep_going, loaded=loaded)
-    if imu != ImuOptions():
-        recorded.close()
-        raise click.UsageError(
-            f"{path} holds poses, which are exported as they are: options of the IMU have no effect; `tsgt process` computes "
-            "poses with them"
-        )
     return _carried_over(itertools.chain([first], recorded), point)
 
 

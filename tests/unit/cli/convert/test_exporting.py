@@ -304,12 +304,35 @@ def test_poses_before_a_set_up_that_was_replaced_are_left_out(tsgt: Tsgt, tmp_pa
     """The tripods may have stood elsewhere, so that their frame is another one; a note counts them."""
     poses = [pose(k, "smoothed", float(k)) for k in range(5)]
     path = tmp_path / "reload.jsonl"
+    moved = dataclasses.replace(PARAMETERS, stations=PARAMETERS.stations[::-1])
     path.write_bytes(
-        recording_bytes(*poses[:3]) + b"".join(encode_line(r) + b"\n" for r in (PARAMETERS, *poses[3:]))
+        recording_bytes(*poses[:3])
+        + b"".join(encode_line(r) + b"\n" for r in (moved, poses[3], moved, poses[4]))
     )
     outcome = tsgt("export", path, "--format", "tum")
-    assert xs(outcome) == [3.0, 4.0]
+    assert xs(outcome) == [3.0, 4.0]  # The same set-up may be read again
     assert "3 poses before the set-up was replaced are left out" in outcome.err
+
+
+def test_file_without_a_valid_pose_has_no_trajectory(tsgt: Tsgt, tmp_path: Path) -> None:
+    """TUM has valid poses only; CSV has all, with the reason why one is invalid."""
+    path = tmp_path / "invalid.jsonl"
+    path.write_bytes(recording_bytes(NO_POSE))
+    outcome = tsgt("export", path, "--output", tmp_path / "out.tum")
+    assert outcome.code == 1
+    assert "has no valid pose; --format csv tells why each pose is invalid" in outcome.err
+    assert not (tmp_path / "out.tum").exists()
+    assert "outage" in tsgt("export", path, "--format", "csv").out
+
+
+def test_mcap_without_a_valid_pose_is_noted(tsgt: Tsgt, tmp_path: Path) -> None:
+    """It still shows the prisms."""
+    path, output = tmp_path / "invalid.jsonl", tmp_path / "out.mcap"
+    path.write_bytes(recording_bytes(measurement(0), NO_POSE))
+    outcome = tsgt("export", path, "--output", output)
+    assert outcome.code == 0
+    assert "has no valid pose, only positions of prisms" in outcome.err
+    assert "/tsgt/prism1" in read(output)
 
 
 def test_joined_runs_that_overlap_are_an_error(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from tsgt.analysis.evaluation import distances_at_epochs
 from tsgt.analysis.formats import QUALITIES, SECOND_NS
+from tsgt.analysis.text_file import utf8_name
 from tsgt.errors import InputFileError, MissingExtraError, RecordingError
 from tsgt.geometry import interpolate
 
@@ -177,12 +178,12 @@ def receivers(files: Sequence[PosFile]) -> tuple[Receiver, ...]:
 def _names(paths: Sequence[Path]) -> list[str]:
     """Return the shortest names that distinguish the files."""
     for names in (
-        [path.stem for path in paths],
-        [f"{path.absolute().parent.name}/{path.stem}" for path in paths],
+        [utf8_name(path.stem) for path in paths],
+        [utf8_name(f"{path.absolute().parent.name}/{path.stem}") for path in paths],
     ):
         if len(set(names)) == len(names):
             return names
-    return [str(path) for path in paths]
+    return [utf8_name(str(path)) for path in paths]
 
 
 def unix_times_ns(file: PosFile) -> NDArray[np.int64]:

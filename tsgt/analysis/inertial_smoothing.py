@@ -104,7 +104,7 @@ class ImuUse:
         default_factory=lambda: np.empty(0)
     )  # (N,) samples of shocks, in their order
     complete: bool = False  # Three prisms have poses without it, which are degraded where they contradict it, and else invalid
-    odometry_samples: int = 0  # Of the wheel odometry that was used with it
+    odometry_samples: int = 0  # Of the wheel odometry that was used with it, while there were measurements
 
     def unused_at(self, time_s: FloatArray) -> NDArray[np.bool_]:
         """(N,) whether the IMU is not to be used at times."""
@@ -173,9 +173,11 @@ def fit_with_imu(
             "tsgt import imu --align"
         )
 
-    wheels = None
+    wheels, driven = None, 0
     if parameters.odometry is not None and odometry:
-        wheels = wheel_samples(odometry, parameters.odometry, origin_ns), parameters.odometry
+        speeds = wheel_samples(odometry, parameters.odometry, origin_ns)
+        driven = int(np.count_nonzero((speeds.end_s >= start_s) & (speeds.end_s <= end_s)))
+        wheels = (speeds, parameters.odometry) if driven else None
 
     def fitted(
         scales: FloatArray,
@@ -239,7 +241,7 @@ def fit_with_imu(
         moved_s,
         shocks_s,
         complete,
-        0 if wheels is None else len(wheels[0]),
+        driven,
     )
 
 

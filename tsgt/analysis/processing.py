@@ -44,7 +44,7 @@ def process(
     parameters = recording.parameters
     pipeline = LinearEstimator(parameters)
     measurements = plausible_measurements(recording)
-    check_prisms_measured(parameters, measurements, path)
+    check_prisms_measured(recording, measurements, path)
     check_time_span(parameters, measurements, path)
     for measurement in sorted(measurements, key=lambda m: m.stamp_ns):
         pipeline.add(measurement)

@@ -222,7 +222,7 @@ def _prepared(recording: Recording, path: Path, refine: Refine) -> _Prepared:
     names = [prism.prism for prism in parameters.prisms]
     check_layout([prism.position_m for prism in parameters.prisms], names=names, imu=not without_imu)
     check_measured = check_prisms_measured if without_imu else check_any_measured
-    check_measured(parameters, measurements, path)
+    check_measured(recording, measurements, path)
     check_time_span(parameters, measurements, path)
     origin_ns = min(m.stamp_ns for m in measurements)
     observations, sources = build_observations(parameters, measurements, origin_ns=origin_ns)

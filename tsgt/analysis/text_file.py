@@ -1,4 +1,4 @@
-"""Text files of users and of other programs."""
+"""Text files of users and of other programs, and names of files in texts."""
 
 from __future__ import annotations
 
@@ -21,3 +21,8 @@ def read_text(path: Path) -> str:
         raise InputFileError(f"cannot be read: {error.strerror or error}", path=path) from error
     except UnicodeDecodeError as error:
         raise InputFileError("is not a text file", path=path) from error
+
+
+def utf8_name(name: str) -> str:
+    """Return the name of a file as text of another file: bytes that are not UTF-8, as of a system with Latin-1, are replaced."""
+    return name.encode(errors="surrogateescape").decode(errors="replace")

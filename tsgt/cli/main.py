@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 failed with one line that says why, 2 usage or configurati
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import sys
 from typing import Any, NoReturn
@@ -134,4 +135,8 @@ def run(command: click.Command, arguments: list[str] | None = None) -> NoReturn:
 
 def main() -> NoReturn:
     """Entry point of the script ``tsgt``."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(
+            errors="surrogateescape"
+        )  # Names of files need not be text in the locale's encoding
     run(cli)

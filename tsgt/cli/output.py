@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import math
+import os
 import sys
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsgt.errors import MissingExtraError
+from tsgt.errors import MissingExtraError, OutputFileError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -105,6 +107,17 @@ def require_new_file(path: Path | None) -> None:
         raise click.UsageError(f"{path} exists; choose another file")
     if not path.absolute().parent.is_dir():
         raise click.UsageError(f"{path}: no such folder")
+
+
+def require_folder(path: Path | None) -> None:
+    """Raise OutputFileError before a long run if a file to write has no folder, or one that cannot be written."""
+    if path is None or (path.exists() and not path.is_file()):  # A pipe is written directly
+        return
+    folder = path.resolve().parent
+    if not folder.is_dir():
+        raise OutputFileError(f"cannot be written ({os.strerror(errno.ENOENT)})", path=path)
+    if not os.access(folder, os.W_OK):
+        raise OutputFileError(f"cannot be written ({os.strerror(errno.EACCES)})", path=path)
 
 
 def refuse_overwrite(inputs: Iterable[Path | None], output: Path | None) -> None:

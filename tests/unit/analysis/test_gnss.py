@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import sys
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -219,6 +220,12 @@ def test_receiver_names_are_unique(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         files.append(receiver(tmp_path / name, "rover", epochs(2), way(epochs(2))))
     assert [each.name for each in receivers(files)] == ["front/rover", "back/rover"]
+
+
+def test_bytes_of_names_that_are_not_utf8_are_replaced(tmp_path: Path) -> None:
+    """The names are drawn and printed; a system with Latin-1 has written those of the files."""
+    files = [receiver(tmp_path, os.fsdecode(name), epochs(2), way(epochs(2))) for name in (b"v\xe4", b"back")]
+    assert [each.name for each in receivers(files)] == ["v\ufffd", "back"]
 
 
 def test_both_are_cut_to_the_common_interval(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from tsgt.analysis.smoothing import smooth_recording
 from tsgt.errors import DegenerateGeometryError, RecordingError
 from tsgt.estimation import Degradation, Reason, named_point
 from tsgt.geometry import cartesian_to_polar, polar_to_cartesian
-from tsgt.model import PolarMeasurement, SetupCovariance
+from tsgt.model import OdometryParameters, OdometrySamples, PolarMeasurement, SetupCovariance
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -124,6 +124,28 @@ def test_samples_of_another_day_are_an_error_of_two_stations() -> None:
     ]
     with pytest.raises(RecordingError, match=r"do not overlap with the measurements in time; .*; --no-imu"):
         smooth(replace(recording, imu_samples=later))
+
+
+@pytest.mark.parametrize(("shift_s", "used"), [(1.0, 40), (-1.0, 13), (86_400.0, 0)])
+def test_wheel_odometry_of_another_time_is_not_used(shift_s: float, used: int) -> None:
+    """Only samples within the time of the measurements count: the others have no effect."""
+    recording = imu_recording(shaken_drive(8.0), stations=1)
+    stamps = tuple(START + round(1e9 * (shift_s + 0.05 * n)) for n in range(1, 41))
+    driven = OdometrySamples(
+        sequence=0,
+        received_ns=stamps[-1],
+        stamp_ns=stamps,
+        duration_ns=(50_000_000,) * len(stamps),
+        instrument_time_ns=None,
+        speed_mps=(0.5,) * len(stamps),
+        yaw_rate_radps=None,
+        valid=(True,) * len(stamps),
+    )
+    parameters = replace(recording.parameters, odometry=OdometryParameters())
+    found = smooth(replace(recording, parameters=parameters, odometry=[driven]))
+    assert found.imu is not None
+    assert found.imu.odometry_samples == used
+    assert (found.imu.fit.wheels is None) == (used == 0)
 
 
 @pytest.mark.slow

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 from harness.drives.scene import START, driving, stationary_scene
 
-from tsgt.analysis.processing import has_raw_angles, process
+from tsgt.analysis.processing import has_raw_angles, process, with_estimator
 from tsgt.analysis.setup_replacement import with_calibration, with_layout
+from tsgt.analysis.validation import no_valid_pose_message
 from tsgt.config import PrismLayout, StationCalibration, StationSetup
 from tsgt.errors import ConfigError, RecordingError
+from tsgt.estimation import PoseBatch, Reason
 from tsgt.model import PointMeasurement, SetupCovariance, Status
 from tsgt.recording import Recording, RecordingHeader
 
 if TYPE_CHECKING:
+    from tsgt.analysis.processing import Estimator
     from tsgt.model import Measurement, Parameters, Vector3
 
 PATH = Path("field.jsonl")
@@ -93,6 +96,51 @@ def test_station_with_errors_only_is_named_with_them() -> None:
         RecordingError, match=r"prism 1 has no usable .*10 with status no_target \(7\), tilt \(3\)"
     ):
         process(recording_of(spoilt), path=PATH)
+
+
+def dated_late(measurement: Measurement) -> Measurement:
+    """Return a measurement that is dated two seconds after it arrived."""
+    return replace(measurement, stamp_ns=measurement.received_ns + 2 * 10**9)
+
+
+def test_measurements_dated_after_their_arrival_are_named() -> None:
+    """Beside the statuses of the others; the message does not say that the station sent nothing."""
+    measurements = [
+        m if m.station != 1 else replace(m, status=Status.TILT) if i < 3 else dated_late(m)
+        for i, m in enumerate(drive())
+    ]
+    with pytest.raises(
+        RecordingError,
+        match=r"prism 1 has no usable .*\(1 with status tilt \(1\), 9 dated more than 1 s after they arrived",
+    ):
+        process(recording_of(measurements), path=PATH)
+
+
+def test_recording_with_only_measurements_dated_after_their_arrival_is_rejected() -> None:
+    """The message counts them."""
+    with pytest.raises(
+        RecordingError, match="holds 30 measurements, all dated more than 1 s after they arrived"
+    ):
+        process(recording_of([dated_late(m) for m in drive()]), path=PATH)
+
+
+@pytest.mark.parametrize("estimator", ["linear", "continuous"])
+def test_measurements_of_one_instant_are_rejected(estimator: Estimator) -> None:
+    """An unusable one at another time does not change that."""
+    first, *others = drive()[:3]
+    same = [first, *(replace(m, stamp_ns=first.stamp_ns) for m in others)]
+    blind = replace(drive()[-1], status=Status.NO_TARGET)
+    with pytest.raises(RecordingError, match=r"all of one instant.*record for longer"):
+        process(with_estimator(recording_of([*same, blind]), estimator), path=PATH)
+
+
+def test_contradicted_poses_have_their_own_advice() -> None:
+    """It precedes that for outages, which every recording has."""
+    poses = PoseBatch.blank(START + np.arange(3), (1, 2))
+    poses.reason[:] = Reason.CONTRADICTED, Reason.OUTAGE, Reason.OUTAGE
+    message = no_valid_pose_message(poses, SCENE.parameters)
+    assert "a tripod, a prism or the IMU may have moved" in message
+    assert "times overlap" not in message
 
 
 def test_reason_of_computed_poses_precedes_outages() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,10 +77,17 @@ def calibrate_recording(
     """Calibrate from all measurements, and for cross-validation (``held_out``) five more times without a fifth of them.
 
     ``known`` has the parameters to estimate and their priors. Without ``frames_known`` the frames are initialised from
-    motion (frame 1 remains). Raises GeometryError without measurements, or if the motion does not determine the set-up.
+    motion (frame 1 remains). Raises GeometryError without measurements or their noise, or if the motion does not determine the set-up.
     """
     if not recording.measurements:
         raise GeometryError("the recording has no measurements")
+    noises = [asdict(station.noise) for station in recording.parameters.stations]
+    if noises and not any(value for noise in noises for value in noise.values()):
+        *first, last = noises[0]
+        raise GeometryError(
+            f"{', '.join(first)} and {last} of all stations are 0 in the recording's parameters, which gives the measurements no "
+            "weights; state the noise of the data sheet there, and for further recordings in the master's configuration: [stations.noise]"
+        )
     origin_ns = min(measurement.stamp_ns for measurement in recording.measurements)
     observations, _ = build_observations(recording.parameters, recording.measurements, origin_ns=origin_ns)
     report = on_progress or (lambda _: None)

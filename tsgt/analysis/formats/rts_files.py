@@ -84,12 +84,15 @@ def read_tracks(paths: Sequence[Path]) -> tuple[PublishedTrack, ...]:
     return tracks
 
 
-def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPosition, ...]:
+def read_prisms(
+    path: Path, numbers: Sequence[int] = (1, 2, 3), *, imu: bool = False
+) -> tuple[PrismPosition, ...]:
     """Read the positions of the tracked prisms on the robot, in the order of ``numbers``.
 
     From the authors' ``sensor_positions.csv``: separated by spaces, rows 1 to 3 are the prisms 1 to 3, starting with x, y, z
     in m in the robot frame, the rest is ignored; or from a ``.toml`` of kind ``prism_layout``. Raises InputFileError if a
-    row or a number is missing, or the prisms coincide or lie in a line; ConfigError if the set-up file cannot be used.
+    row or a number is missing, or the prisms coincide or, without ``imu``, lie in a line or are too few; ConfigError if the set-up
+    file cannot be used.
     """
     if path.suffix == ".toml":
         from tsgt.config import load_prism_layout  # noqa: PLC0415 (a tenth of the start-up of `tsgt process`)
@@ -105,7 +108,7 @@ def read_prisms(path: Path, numbers: Sequence[int] = (1, 2, 3)) -> tuple[PrismPo
         )
     prisms = tuple(PrismPosition(prism=prism, position_m=positions[prism]) for prism in numbers)
     try:
-        check_layout([prism.position_m for prism in prisms])
+        check_layout([prism.position_m for prism in prisms], names=numbers, imu=imu)
     except DegenerateGeometryError as error:
         raise InputFileError(str(error), path=path) from error
     return prisms

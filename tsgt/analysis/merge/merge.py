@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.analysis.merge.matching import Boot, IndexedJournal, better
 from tsgt.analysis.merge.recording_index import RecordingIndex, identity, index_recording
+from tsgt.analysis.text_file import utf8_name
 from tsgt.errors import RecordingError
 from tsgt.estimation import instrument_time_sigma_s
 from tsgt.model import MAX_INSTANT_NS, PolarMeasurement
@@ -247,4 +248,4 @@ def _record(
         stamp_bound_ns=time.bound_ns,
         received_ns=time.unix_ns,
     )
-    return MergedRecord(journal=path.name, measurement=measurement)
+    return MergedRecord(journal=utf8_name(path.name), measurement=measurement)

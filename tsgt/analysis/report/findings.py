@@ -29,13 +29,13 @@ from tsgt.analysis.report.log import Log, read_log
 from tsgt.analysis.report.motion import distance_error_series
 from tsgt.analysis.report.stations import station_records, station_statistics
 from tsgt.analysis.smoothing import smooth_recording
-from tsgt.analysis.validation import plausible_measurements
+from tsgt.analysis.validation import no_measurements_message, plausible_measurements
 from tsgt.errors import GeometryError, RecordingError
 from tsgt.estimation import build_tracks, centroid_at_point, point_label
 from tsgt.geometry import check_layout, rotation_from_quaternion, transform_from
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from tsgt.analysis.diagnosis import Diagnosis
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from tsgt.analysis.report.motion import DistanceErrorSeries
     from tsgt.analysis.report.stations import StationRecord, StationStatistics
     from tsgt.analysis.smoothing import SmoothedRecording
-    from tsgt.estimation import PoseBatch
+    from tsgt.estimation import PoseBatch, Track
     from tsgt.geometry import FloatArray
     from tsgt.recording import Recording
 
@@ -183,7 +183,9 @@ def collect_findings(
     parameters = recording.parameters
     measurements = plausible_measurements(recording)
     if not measurements:
-        raise RecordingError("holds no measurements, so there is nothing to report", path=path)
+        raise RecordingError(
+            f"{no_measurements_message(recording)}, so there is nothing to report", path=path
+        )
     problems: dict[str, str] = {}
     start_ns, end_ns = min(m.stamp_ns for m in measurements), max(m.stamp_ns for m in measurements)
     records = station_records(measurements, [s.station for s in parameters.stations])
@@ -199,12 +201,7 @@ def collect_findings(
     report(fitted)
     linear = attempt("linear", lambda: process(with_estimator(recording, "linear"), path=path))
     tracks = build_tracks(parameters, measurements)
-    unmeasured = [prism for prism, track in tracks.items() if not len(track)]
-    if unmeasured:
-        names = " and ".join(f"prism {prism}" for prism in unmeasured)
-        problems["inter_prism"] = f"no usable measurement of {names}"
-    elif len(tracks) == 1:
-        problems["inter_prism"] = "the robot has a single prism"
+    problems |= distances_problem(tracks)
     epochs = None if "inter_prism" in problems else distances_at_epochs(parameters, tracks)
     distances = None if epochs is None else inter_prism(parameters, tracks, stationary_ns, epochs)
     held_out = None
@@ -277,6 +274,14 @@ def collect_findings(
     )
 
 
+def distances_problem(tracks: Mapping[int, Track]) -> dict[str, str]:
+    """Return why there are no inter-prism distances, as an entry of ``Findings.problems``; empty if there may be."""
+    unmeasured = [f"prism {prism}" for prism, track in tracks.items() if not len(track)]
+    if unmeasured:
+        return {"inter_prism": f"no usable measurement of {' and '.join(unmeasured)}"}
+    return {"inter_prism": "the robot has a single prism"} if len(tracks) == 1 else {}
+
+
 @dataclass(frozen=True, slots=True)
 class _Attempts:
     """Computes what may be impossible, and notes why it is."""
@@ -288,7 +293,8 @@ class _Attempts:
         try:
             return compute()
         except (RecordingError, GeometryError) as error:
-            self.problems[name] = str(error).removeprefix(f"{self.path}: ")
+            # Of both estimators, that of the first.
+            self.problems.setdefault(name, str(error).removeprefix(f"{self.path}: "))
             return None
 
 

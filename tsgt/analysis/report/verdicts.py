@@ -234,3 +234,9 @@ def _reference(f: Findings) -> Iterator[Verdict]:
                 else f"; its covariances are inconsistent with that (NEES {each.nees.mean:.1f}, expected 6)."
             ),
         )
+    if "aligned" in f.problems:
+        yield Verdict(
+            Level.CARE,
+            f"The poses are not aligned with the reference: {f.problems['aligned']}.",
+            "Use `--align translation` or `--align none`: a rigid alignment needs a path that is not straight.",
+        )

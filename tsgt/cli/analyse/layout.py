@@ -22,6 +22,7 @@ from tsgt.analysis.design import (
     pose_covariances,
     station_arrangements,
 )
+from tsgt.analysis.text_file import utf8_name
 from tsgt.cli.analyse.options import figure_option, point_text, read_layout, usable_layout
 from tsgt.cli.options import FiniteRange, json_option, path_type, point_option, resolved_point
 from tsgt.cli.output import print_json, print_table
@@ -167,7 +168,7 @@ def layout_command(
         return
     wanted = {source: _tracked({p.prism: p.position_m for p in known.prisms}, slots, source)}
     for path in layouts:
-        wanted[str(path)] = _tracked(read_layout(path), slots, path)
+        wanted[utf8_name(str(path))] = _tracked(read_layout(path), slots, path)
 
     def candidate(name: str, layout: FloatArray) -> _Candidate:
         return _Candidate(name, layout, pose_covariances(layout, stations, robot_poses, point_m))
@@ -245,7 +246,7 @@ def _setup(
                 orientation_xyzw=(0.0, 0.0, 0.0, 1.0),
                 noise=IMU_NOISE[imu_class],
             )
-        return _Setup(known, imu, _places(area), route=False, source=str(config_path))
+        return _Setup(known, imu, _places(area), route=False, source=utf8_name(str(config_path)))
     scenario = find_scenario(scenario_name or "dynamic")
     if imu_class is not None:
         simulated = scenario.imu.model_copy(update={"model": imu_class})

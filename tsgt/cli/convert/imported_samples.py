@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 import tsgt
+from tsgt.analysis.text_file import utf8_name
 from tsgt.clock import SystemClock
 from tsgt.recording import RecordingHeader, encode_line, write_atomically
 
@@ -27,7 +28,7 @@ def write_samples(
     header = RecordingHeader(
         software=f"tsgt {tsgt.__version__}",
         created_ns=SystemClock().realtime_ns(),
-        source=f"import {device}: {' '.join(path.name for path in files)}",
+        source=f"import {device}: {' '.join(utf8_name(path.name) for path in files)}",
     )
     gaps, expected = 0, 0
     try:

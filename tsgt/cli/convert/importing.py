@@ -22,7 +22,8 @@ from tsgt.analysis.rts_import import (
     polar_measurements,
     stations_from_targets,
 )
-from tsgt.analysis.setup_replacement import with_calibration, with_layout
+from tsgt.analysis.setup_replacement import with_calibration
+from tsgt.analysis.text_file import utf8_name
 from tsgt.cli.convert.cut_tables import note_cut_tables
 from tsgt.cli.convert.import_imu import import_imu
 from tsgt.cli.convert.import_odometry import import_odometry
@@ -38,6 +39,8 @@ from tsgt.cli.options import (
 from tsgt.cli.output import print_json, refuse_overwrite
 from tsgt.cli.recordings import write_recording
 from tsgt.config import load_prism_layout, load_station_calibration, setup_covariance
+from tsgt.errors import DegenerateGeometryError
+from tsgt.geometry import check_layout
 from tsgt.model import Parameters, StationParameters
 
 if TYPE_CHECKING:
@@ -124,7 +127,7 @@ def import_rts(
         measurements = polar_measurements(published, solved.stations)
     write_recording(
         output,
-        source=f"import rts: {' '.join(path.name for path in sources)}",
+        source=f"import rts: {' '.join(utf8_name(path.name) for path in sources)}",
         parameters=parameters,
         records=measurements,
     )
@@ -173,7 +176,8 @@ def import_polar(
     note_cut_tables(tracks)
     check_tracks(measurements, tracks)
     tracked = tracked_prisms(measurements)
-    layout = read_prisms(prisms, sorted({m.prism for m in measurements}))
+    layout = read_prisms(prisms, sorted({m.prism for m in measurements}), imu=True)
+    _note_need_of_imu(layout, prisms)
     if targets is not None:
         solved = _solved_stations(targets, target_constant_mm, prism_constant_mm, tracked)
         parameters = _parameters(solved.stations, layout, prisms, solved.covariance)
@@ -188,11 +192,19 @@ def import_polar(
         )
     write_recording(
         output,
-        source=f"import polar: {' '.join(path.name for path in sources)}",
+        source=f"import polar: {' '.join(utf8_name(path.name) for path in sources)}",
         parameters=parameters,
         records=measurements,
     )
     _print_summary(output, measurements, as_json=as_json)
+
+
+def _note_need_of_imu(layout: tuple[PrismPosition, ...], path: Path) -> None:
+    """Print a note where the prisms give poses with an IMU alone, whose samples and set-up are given with the recording."""
+    try:
+        check_layout([prism.position_m for prism in layout], names=[prism.prism for prism in layout])
+    except DegenerateGeometryError as error:
+        click.echo(f"note: {path}: {error}; tsgt process needs --imu and --imu-setup", err=True)
 
 
 def _solved_stations(
@@ -228,16 +240,17 @@ def _parameters(
     covariance: SetupCovariance | None = None,
 ) -> Parameters:
     """Return parameters with the covariance of the frames, and of a prism layout from a set-up file."""
-    parameters = Parameters(
+    of_prisms = load_prism_layout(prisms).covariance if prisms.suffix == ".toml" else None
+    return Parameters(
         stations=stations,
         prisms=layout,
         setup_covariance=setup_covariance(
-            covariance, None, station_numbers=(s.station for s in stations), prism_numbers=()
+            covariance,
+            of_prisms,
+            station_numbers=(s.station for s in stations),
+            prism_numbers=(p.prism for p in layout),
         ),
     )
-    if prisms.suffix != ".toml":
-        return parameters
-    return with_layout(parameters, load_prism_layout(prisms), path=prisms)
 
 
 def _print_summary(output: Path, measurements: Sequence[Measurement], *, as_json: bool) -> None:

@@ -20,13 +20,15 @@ from tsgt.analysis.compare import (
     reference_keys,
 )
 from tsgt.analysis.formats import write_sensor_mounting
+from tsgt.analysis.formats.bag import is_bag
 from tsgt.analysis.formats.trajectories import read_estimates
+from tsgt.analysis.text_file import utf8_name
 from tsgt.cli.desk.comparison_reference import read_reference
 from tsgt.cli.desk.comparison_report import write_comparison_report
 from tsgt.cli.desk.comparison_text import print_comparisons
 from tsgt.cli.desk.report import PAGE_NAME, refuse_report
 from tsgt.cli.options import FiniteRange, OutputFile, json_option, path_type, point_option
-from tsgt.cli.output import print_json, refuse_overwrite, require_extra
+from tsgt.cli.output import print_json, refuse_overwrite, require_extra, require_folder
 from tsgt.cli.progress import progress
 from tsgt.cli.recordings import write_lines
 from tsgt.config import SensorMountingFile, load
@@ -146,6 +148,9 @@ def compare(
         require_extra("reports", "matplotlib", "jinja2", extra="report")
     for path in (csv_path, output):
         refuse_overwrite([reference, *estimates, extrinsic_path], path)
+        require_folder(path)
+    if topics and not any(map(is_bag, estimates)):
+        raise click.UsageError("--topic needs a bag: other files have no topics")
     found = [each for path in estimates for each in read_estimates(path, topics=topics)]
     if output is not None and len(found) != 1:
         raise click.UsageError(f"--output needs one estimate, got {len(found)}")
@@ -163,7 +168,7 @@ def compare(
         "estimates": {each.name: each.keys() for each in compared},
     }
     if report_folder is not None:
-        write_comparison_report(compared, figures, report_folder, reference.name)
+        write_comparison_report(compared, figures, report_folder, utf8_name(reference.name))
     if as_json:
         print_json(figures)
         return

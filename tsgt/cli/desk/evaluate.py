@@ -142,7 +142,7 @@ def evaluate(
     imu: ImuOptions,
     keep_going: bool,
     as_json: bool,
-) -> None:
+) -> int:
     """Assess the accuracy of a recording.
 
     Prints a verdict, then internal consistency (distances between prisms, which are constant on a rigid robot;
@@ -172,18 +172,18 @@ def evaluate(
     refuse_unused_wheels(loaded, recording, imu)
     reference = load_reference(reference_path, reference_point, loaded.parameters)
     if report_folder is not None:
-        report_evaluation(
+        return report_evaluation(
             loaded,
             recording,
             report_folder,
             reference=reference,
+            reference_path=reference_path,
             align=alignment,
             odometry=odometry,
             with_held_out=with_held_out,
             refine=refine,
             as_json=as_json,
         )
-        return
     found = _evaluated(
         loaded,
         recording,
@@ -198,6 +198,7 @@ def evaluate(
         print_json(_keys(found))
     else:
         _print_evaluation(found, reference_path, alignment)
+    return 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,6 +13,7 @@ from tsgt.analysis.inertial_smoothing import imu_keys
 from tsgt.analysis.processing import process as process_recording
 from tsgt.analysis.refinement import refinement_keys, refinement_text
 from tsgt.analysis.smoothing import smooth_poses
+from tsgt.analysis.text_file import utf8_name
 from tsgt.cli.desk.unused_options import refuse_unused_by_linear, refuse_unused_wheels
 from tsgt.cli.options import (
     FiniteRange,
@@ -23,7 +24,7 @@ from tsgt.cli.options import (
     recording_argument,
     unknown_suffix,
 )
-from tsgt.cli.output import print_json, refuse_overwrite
+from tsgt.cli.output import print_json, refuse_overwrite, require_folder
 from tsgt.cli.progress import TUNING, counted, progress
 from tsgt.cli.recordings import (
     duration_s,
@@ -111,6 +112,7 @@ def process(
     if format_name is None:
         raise click.UsageError(f"{unknown_suffix(output, tuple(FORMATS))}; or give --format")
     refuse_overwrite([recording, frames, prisms, imu.samples, imu.setup, imu.odometry], output)
+    require_folder(output)
     started_s = time.perf_counter()
     loaded = load(
         recording,
@@ -133,7 +135,7 @@ def process(
             if format_name == "csv":
                 write_lines(output, pose_csv(records))
             else:
-                source = f"process: {recording.name}"
+                source = f"process: {utf8_name(recording.name)}"
                 write_recording(output, source=source, parameters=parameters, records=records)
     if as_json:
         print_json(

@@ -18,7 +18,7 @@ from tsgt.errors import DegenerateGeometryError, InputFileError, RecordingError
 from tsgt.estimation import PoseBatch, centroid_at_point, point_label
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from tsgt.analysis.evaluation import (
@@ -89,12 +89,7 @@ def compare_estimators(
     both: tuple[tuple[Estimator, PoseBatch], ...] = (("linear", linear), ("continuous", continuous.poses))
     unaligned = {name: compare(poses, reference, centroid_m) for name, poses in both}
     if not any(found.compared for found in unaligned.values()):
-        stamps = np.concatenate([poses.stamp_ns[poses.valid] for _, poses in both])
-        raise InputFileError(
-            f"has no pose within 0.1 s of a valid one of {path}: it covers {_span(reference.stamp_ns)}, the valid poses "
-            f"{_span(stamps)} (UTC); 2 s at both ends of the reference are not used",
-            path=reference_path,
-        )
+        raise not_compared([poses for _, poses in both], reference, paths)
     try:
         return {
             name: Comparison(
@@ -108,11 +103,29 @@ def compare_estimators(
             for name, poses in both
         }
     except DegenerateGeometryError as error:
-        raise InputFileError(
-            f"cannot be aligned with --align {align}, which needs a path that is not straight ({error}); use --align "
-            "translation or none",
-            path=reference_path,
-        ) from error
+        raise not_aligned(str(error), align, reference_path) from error
+
+
+def not_compared(
+    found: Iterable[PoseBatch], reference: Reference, paths: tuple[Path, Path]
+) -> InputFileError:
+    """Return the error of a reference without a valid pose near it; ``paths`` as for :func:`compare_estimators`."""
+    path, reference_path = paths
+    stamps = np.concatenate([poses.stamp_ns[poses.valid] for poses in found])
+    return InputFileError(
+        f"has no pose within 0.1 s of a valid one of {path}: it covers {_span(reference.stamp_ns)}, the valid poses "
+        f"{_span(stamps)} (UTC); 2 s at both ends of the reference are not used",
+        path=reference_path,
+    )
+
+
+def not_aligned(why: str, align: Align | None, reference_path: Path) -> InputFileError:
+    """Return the error of a degenerate alignment."""
+    return InputFileError(
+        f"cannot be aligned with --align {align}, which needs a path that is not straight ({why}); use --align "
+        "translation or none",
+        path=reference_path,
+    )
 
 
 def print_comparisons(

@@ -19,14 +19,17 @@ from tsgt.analysis.report import (
     report_sections,
     verdicts,
 )
+from tsgt.analysis.report.findings import distances_problem
 from tsgt.analysis.report.log import read_log
 from tsgt.analysis.report.motion import distance_error_series
 from tsgt.analysis.report.stations import station_records, station_statistics
+from tsgt.analysis.text_file import utf8_name
 from tsgt.analysis.validation import plausible_measurements
-from tsgt.cli.output import json_text, print_json, refuse_overwrite
+from tsgt.cli.desk.reference import not_aligned, not_compared
+from tsgt.cli.output import CHECK_FAILED, json_text, print_json, refuse_overwrite
 from tsgt.cli.progress import TUNING, progress
 from tsgt.cli.recordings import write_lines
-from tsgt.errors import OutputFileError
+from tsgt.errors import OutputFileError, RecordingError, TsgtError
 from tsgt.estimation import build_tracks
 
 if TYPE_CHECKING:
@@ -68,7 +71,9 @@ def assess(
     start_ns, end_ns = min(stamps), max(stamps)
     records = station_records(measurements, [s.station for s in parameters.stations])
     limit_ns = parameters.pipeline.outage_limit_ns
-    epochs = distances_at_epochs(parameters, build_tracks(parameters, measurements))
+    tracks = build_tracks(parameters, measurements)
+    problems = distances_problem(tracks)
+    epochs = None if problems else distances_at_epochs(parameters, tracks)
     findings = Findings(
         recording=recording,
         path=path,
@@ -80,13 +85,16 @@ def assess(
             each.station: station_statistics(each, start_ns=start_ns, end_ns=end_ns, outage_limit_ns=limit_ns)
             for each in records
         },
-        inter_prism=distances,
-        distance_errors=distance_error_series(parameters, epochs, continuous.poses),
+        inter_prism=None if problems else distances,
+        distance_errors=None
+        if epochs is None
+        else distance_error_series(parameters, epochs, continuous.poses),
         continuous=continuous,
         residuals=residual_statistics(continuous.fit, continuous.sources),
         outliers=outliers(continuous.fit, continuous.sources),
         reference_errors=compared,
         diagnosis=diagnosis,
+        problems=problems,
     )
     return verdicts(findings)
 
@@ -103,12 +111,13 @@ def report_evaluation(
     folder: Path,
     *,
     reference: Reference | None,
+    reference_path: Path | None = None,
     align: Align | None = None,
     odometry: Path | None,
     with_held_out: bool,
     refine: Refine,
     as_json: bool,
-) -> None:
+) -> int:
     """Evaluate a recording and write the report.
 
     Parameters
@@ -117,6 +126,8 @@ def report_evaluation(
         Measurements with the parameters in force, and their file.
     folder
         Folder of the report, created if necessary.
+    reference, reference_path
+        Trajectory to compare poses with, and its file.
     odometry
         File that defines the stationary intervals; None: from the measurements.
     with_held_out
@@ -125,6 +136,11 @@ def report_evaluation(
         What of the set-up may be refined.
     as_json
         Print the numbers instead of the verdicts.
+
+    Returns
+    -------
+    The exit code. Where there are no poses, or they cannot be compared with the reference, the report is written, and the last line
+    is the error of the command without a report.
     """
     stationary_ns = None if odometry is None else read_stationary_intervals(odometry)
     with progress("evaluating", first=TUNING) as on_progress:
@@ -142,9 +158,28 @@ def report_evaluation(
         write_report(findings, folder, on_progress=on_progress)
     if as_json:
         print_json(report_numbers(findings))
-        return
-    print_verdicts(verdicts(findings))
-    click.echo(f"\n{folder / PAGE_NAME}")
+    else:
+        print_verdicts(verdicts(findings))
+        click.echo(f"\n{folder / PAGE_NAME}")
+    missing = _missing(findings, reference_path, align)
+    if missing is None:
+        return 0
+    click.echo(f"error: {missing}", err=True)
+    return CHECK_FAILED
+
+
+def _missing(findings: Findings, reference_path: Path | None, align: Align | None) -> TsgtError | None:
+    """Return an error if there are no poses, or none was compared or aligned with the reference."""
+    if findings.poses is None:
+        return RecordingError(findings.problems["continuous"], path=findings.path)
+    if findings.reference is None or reference_path is None:
+        return None
+    if not any(found.compared for found in findings.reference_errors.values()):
+        paths = (findings.path, reference_path)
+        return not_compared(findings.poses_by_estimator.values(), findings.reference, paths)
+    if "aligned" in findings.problems:
+        return not_aligned(findings.problems["aligned"], align, reference_path)
+    return None
 
 
 def write_report(
@@ -159,7 +194,7 @@ def write_report(
     """
     write_page(
         folder,
-        f"Report of {findings.path.name}",
+        f"Report of {utf8_name(findings.path.name)}",
         headline(findings),
         map_figure(findings),
         report_sections(findings),

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tsgt.errors import InputFileError
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -15,11 +17,26 @@ if TYPE_CHECKING:
 
 
 def refuse_unused_wheels(recording: Recording, path: Path, imu: ImuOptions) -> None:
-    """Raise UsageError for wheel odometry of a recording without an IMU."""
-    if imu.odometry is not None and recording.parameters.imu is None:
+    """Raise UsageError for wheel odometry of a recording without an IMU, and InputFileError for a file without any, or of another time."""
+    if imu.odometry is None:
+        return
+    if recording.parameters.imu is None:
         raise click.UsageError(
             f"{path} has no parameters of an IMU, and wheel odometry is used with one only; give --imu and --imu-setup, "
             "or omit --wheel-odometry"
+        )
+    if not recording.odometry:
+        raise InputFileError(
+            "contains no wheel odometry; give a file of tsgt import odometry", path=imu.odometry
+        )
+    stamps_ns = [m.stamp_ns for m in recording.measurements]
+    first_ns, last_ns = min(stamps_ns, default=0), max(stamps_ns, default=0)
+    driven_ns = (stamp_ns for each in recording.odometry for stamp_ns in each.stamp_ns)
+    if stamps_ns and not any(first_ns <= stamp_ns <= last_ns for stamp_ns in driven_ns):
+        raise InputFileError(
+            "the samples of the wheel odometry do not overlap with the measurements in time; give those of this drive, or correct "
+            "their clock: tsgt import odometry --offset-ms",
+            path=imu.odometry,
         )
 
 

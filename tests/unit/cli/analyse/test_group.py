@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -124,6 +125,13 @@ def test_layouts_are_ranked(tsgt: Tsgt, small: Path) -> None:
     assert wide["worst_rotation_sigma_mrad"] >= wide["rotation_sigma_mrad"]
     lengths = math.hypot(*wide["position_axes_sigma_mm"])
     assert lengths == pytest.approx(wide["position_sigma_mm"])
+
+
+def test_bytes_of_names_that_are_not_utf8_are_replaced(tsgt: Tsgt, small: Path) -> None:
+    """They are drawn and printed; a system with Latin-1 has written such names."""
+    named = small.rename(small.with_name(os.fsdecode(b"s\xe4.toml")))
+    study = tsgt("analyse", "layout", named, "--json").json()
+    assert study["ranking"] == ["dynamic", str(small.with_name("s\ufffd.toml"))]
 
 
 def test_search_finds_a_better_layout_in_the_envelope(tsgt: Tsgt) -> None:

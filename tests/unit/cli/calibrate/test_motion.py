@@ -13,8 +13,10 @@ from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, 
 from tsgt.analysis.calibration import CalibratedRecording, HeldOutComparison, calibrate_recording
 from tsgt.analysis.evaluation import HeldOutErrors
 from tsgt.config import load_station_calibration
+from tsgt.errors import GeometryError
 from tsgt.geometry import exp_so3
 from tsgt.geometry.motion_calibration import SetupPrior
+from tsgt.model import InstrumentNoise
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -89,6 +91,18 @@ def test_result_is_independent_of_the_robot_origin(recording: Path) -> None:
     assert other.calibration.prior.angular_acceleration_sigma_radps2 == pytest.approx(
         one.calibration.prior.angular_acceleration_sigma_radps2, rel=1e-2
     )
+
+
+def test_noise_of_zero_is_refused(recording: Path) -> None:
+    """It gives no weights; the error says which values are 0, and where they are set."""
+    loaded = load_recording(recording)
+    exact = InstrumentNoise(range_sigma_m=0, range_sigma_ppm=0, angle_sigma_rad=0, pointing_sigma_m=0)
+    stations = tuple(replace(station, noise=exact) for station in loaded.parameters.stations)
+    loaded = replace(loaded, parameters=replace(loaded.parameters, stations=stations))
+    known = SetupPrior(translation_sigma_m=0.02, rotation_sigma_rad=0.002)
+    message = r"range_sigma_m, range_sigma_ppm, angle_sigma_rad and pointing_sigma_m of all stations are 0 .*\[stations.noise\]"
+    with pytest.raises(GeometryError, match=message):
+        calibrate_recording(loaded, known, held_out=False)
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from typing import TYPE_CHECKING
 
 from harness.files.cli import called
@@ -63,3 +65,11 @@ def test_empty_table_is_not_called_cut(tmp_path: Path, capsys: pytest.CaptureFix
     (path := tmp_path / "empty.csv").touch()
     note_cut_tables([path])
     assert capsys.readouterr().err == ""
+
+
+def test_bytes_of_a_name_that_are_not_utf8_are_replaced(tmp_path: Path) -> None:
+    """The header names the table, whose name a system with Latin-1 has written."""
+    table, output = write_table(tmp_path / os.fsdecode(b"w\xe4.csv")), tmp_path / "odometry.jsonl"
+    done = called("import", "odometry", table, "--output", output)
+    assert done.code == 0, done.err
+    assert json.loads(output.read_bytes().splitlines()[0])["source"] == "import odometry: w\ufffd.csv"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from typing import TYPE_CHECKING
 
 import pytest
+from harness.drives.scene import LAYOUT
 from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
 
 from tsgt.recording import load_recording
@@ -130,3 +132,57 @@ def test_cut_track_is_imported_with_a_note(tsgt: Tsgt, recording: Path) -> None:
     done = tsgt("import", "polar", "--tracks", tracks, *sources, *CONSTANTS, "--output", out)
     assert done.code == 0, done.err
     assert f"note: {tracks}: the last line has no line end" in done.err
+
+
+def test_bytes_of_names_that_are_not_utf8_are_replaced(tsgt: Tsgt, recording: Path) -> None:
+    """The header names the files, whose names a system with Latin-1 has written."""
+    tracks = exported(tsgt, recording)
+    tracks = tracks.rename(tracks.with_name(os.fsdecode(b"m\xe4.csv")))
+    again = imported(tsgt, tracks, "--targets", recording.with_name("GCP.txt"), *CONSTANTS[:2])
+    header = json.loads(again.read_text(encoding="utf-8").splitlines()[0])
+    assert header["source"] == "import polar: m\ufffd.csv sensor_positions.csv GCP.txt"
+
+
+def test_two_stations_are_imported_with_a_note(tsgt: Tsgt, recording: Path) -> None:
+    """Their poses need an IMU, whose samples and set-up are given when they are computed."""
+    tracks, prisms = exported(tsgt, recording), recording.with_name("prisms.toml")
+    lines = tracks.read_text(encoding="utf-8").splitlines(keepends=True)
+    tracks.write_text("".join(line for line in lines if ",3,3," not in line), encoding="utf-8")
+    tables = [
+        f"[prisms.{k}]\nposition_m = {position}\n" for k, position in enumerate(LAYOUT.tolist(), start=1)
+    ]
+    prisms.write_text("\n".join(['kind = "prism_layout"', *tables]), encoding="utf-8")
+    two = recording.with_name("two.jsonl")
+    sources = ("--prisms", prisms, "--targets", recording.with_name("GCP.txt"), *CONSTANTS)
+    done = tsgt("import", "polar", "--tracks", tracks, *sources, "--output", two)
+    assert done.code == 0, done.err
+    needed = "a pose needs at least 3 prisms on the robot, or an IMU and one: the layout has 2"
+    assert f"note: {prisms}: {needed}; tsgt process needs --imu and --imu-setup" in done.err
+    parameters = load_recording(two).parameters
+    assert [(station.station, station.prism) for station in parameters.stations] == [(1, 1), (2, 2)]
+    assert [each.position_m for each in parameters.prisms] == [tuple(each) for each in LAYOUT.tolist()[:2]]
+    processed = tsgt("process", two, "--output", two.with_suffix(".tum"))
+    assert (processed.code, needed in processed.err) == (1, True)
+
+
+def test_layout_keeps_its_covariance(tsgt: Tsgt, recording: Path) -> None:
+    """Of the prisms that were tracked, beside that of the frames."""
+    tracks, prisms = exported(tsgt, recording), recording.with_name("prisms.toml")
+    tables = [
+        f"[prisms.{k}]\nposition_m = {position}\nsigma_m = [0.001, 0.001, 0.002]\n"
+        for k, position in enumerate([*LAYOUT.tolist(), [1.0, 2.0, 3.0]], start=1)
+    ]
+    prisms.write_text("\n".join(['kind = "prism_layout"', *tables]), encoding="utf-8")
+    output = recording.with_name("again.jsonl")
+    sources = ("--prisms", prisms, "--targets", recording.with_name("GCP.txt"), *CONSTANTS)
+    done = tsgt("import", "polar", "--tracks", tracks, *sources, "--output", output)
+    assert (done.code, done.err) == (0, "")
+    known = load_recording(output).parameters.setup_covariance
+    assert known is not None
+    names = known.components
+    assert "station2.x" in names
+    assert [name for name in names if name.startswith("prism")] == [
+        f"prism{k}.{axis}" for k in (1, 2, 3) for axis in "xyz"
+    ]
+    at = names.index("prism2.z")
+    assert known.matrix[at][at] == pytest.approx(4e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 from typing import TYPE_CHECKING
 
@@ -138,6 +139,45 @@ def test_limit_of_sigma_needs_a_covariance(tsgt: Tsgt, tmp_path: Path) -> None:
     reference = write(tmp_path / "reference.tum")
     outcome = tsgt("compare", reference, reference, "--max-sigma-mm", 5)
     assert (outcome.code, "--max-sigma-mm needs" in outcome.err) == (2, True)
+
+
+def test_topic_needs_a_bag(tsgt: Tsgt, tmp_path: Path) -> None:
+    """A text file has no topics: the option would have no effect."""
+    reference = write(tmp_path / "reference.tum")
+    outcome = tsgt("compare", reference, reference, "--topic", "/nothing")
+    assert (outcome.code, "--topic needs a bag" in outcome.err) == (2, True), outcome.err
+
+
+def test_missing_folder_is_noticed_before_the_comparison(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which may take minutes."""
+    monkeypatch.setattr("tsgt.cli.desk.compare.compare_estimate", None)
+    reference = write(tmp_path / "reference.tum")
+    outcome = tsgt("compare", reference, reference, "--csv", tmp_path / "none" / "errors.csv")
+    assert outcome.code == 1
+    assert outcome.err.splitlines() == [
+        f"error: {tmp_path}/none/errors.csv: cannot be written (No such file or directory)"
+    ]
+
+
+def test_bytes_of_names_that_are_not_utf8_are_replaced(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the file of errors and in the report; a system with Latin-1 has written such names."""
+    drawn: list[tuple[str, str]] = []
+    monkeypatch.setattr(
+        "tsgt.cli.desk.compare.write_comparison_report",
+        lambda found, _figures, _folder, reference: drawn.append((found[0].name, reference)),
+    )
+    reference = write(tmp_path / os.fsdecode(b"r\xe4.tum"))
+    estimate = write(tmp_path / os.fsdecode(b"m\xe4.tum"))
+    errors = tmp_path / "errors.csv"
+    options = ("--fit", "none", "--align", "none", "--csv", errors, "--report", tmp_path / "report")
+    outcome = tsgt("compare", reference, estimate, *options)
+    assert outcome.code == 0, outcome.err
+    assert errors.read_text().splitlines()[1].startswith("m\ufffd,")
+    assert drawn == [("m\ufffd", "r\ufffd.tum")]
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from harness.files.records import HEADER, START
+from harness.files.records import HEADER, SECOND, START
 from harness.inertial.imu_recording import IMU, imu_recording, shaken_drive, write
 
 from tsgt.analysis.formats import write_imu_mounting
@@ -89,6 +89,27 @@ def test_wheels_without_an_imu_are_refused(tsgt: Tsgt, folder: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
+    ("shift_ns", "message"),
+    [(None, "contains no wheel odometry"), (86_400 * SECOND, "do not overlap with the measurements in time")],
+)
+def test_wheels_without_effect_are_refused(
+    tsgt: Tsgt, folder: Path, tmp_path: Path, shift_ns: int | None, message: str
+) -> None:
+    """A file without any, as of the samples of the IMU, and that of another day."""
+    wheels, output = folder / "samples.jsonl", tmp_path / "a.tum"
+    if shift_ns is not None:
+        wheels = tmp_path / "wheels.jsonl"
+        other = later(driven(shaken_drive(22.0), 1.0, scale=1.0), shift_ns)
+        wheels.write_bytes(encode_line(HEADER) + b"\n" + encode_line(other) + b"\n")
+    done = tsgt("process", folder / "with.jsonl", "--wheel-odometry", wheels, "--output", output)
+    assert done.code == 1
+    (line,) = done.err.splitlines()
+    assert line.startswith(f"error: {wheels}: ")
+    assert message in line
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
     ("options", "named"),
     [
         (("--refine", "prisms"), "--refine prisms"),
@@ -146,7 +167,7 @@ def test_report_shows_imu_and_wheels(tmp_path: Path) -> None:
     assert innovation["rms"] < 1.5 * innovation["expected"]
     assert max(numbers["gyro_bias_sigma_dps"]) < 0.05
     wheels = numbers["odometry"]
-    assert wheels["samples"] == 438
+    assert wheels["samples"] == 436  # of 438, within the time of the measurements
     assert wheels["covered"] > 0.95
     assert wheels["scale"] == pytest.approx(1 / 0.98 - 1, abs=3 * wheels["scale_sigma"])
     assert wheels["slip_rms"] < 0.02
@@ -174,6 +195,11 @@ def driven(drive: InertialDrive, until_s: float, *, scale: float) -> OdometrySam
         yaw_rate_radps=None,
         valid=(True,) * len(stamps),
     )
+
+
+def later(samples: OdometrySamples, shift_ns: int) -> OdometrySamples:
+    """Return samples of another time."""
+    return replace(samples, stamp_ns=tuple(stamp_ns + shift_ns for stamp_ns in samples.stamp_ns))
 
 
 @pytest.mark.slow

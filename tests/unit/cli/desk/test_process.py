@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -109,6 +110,26 @@ def test_tuned_motion_prior_is_recorded(tsgt: Tsgt, recording: Path) -> None:
         f"  acceleration_correlation_time_s = {result['motion']['acceleration_correlation_time_s']:.3g}\n"
         in text
     )
+
+
+def test_bytes_of_a_name_that_are_not_utf8_are_replaced(tsgt: Tsgt, recording: Path) -> None:
+    """The header of the poses names the recording, whose name a system with Latin-1 has written."""
+    named = recording.rename(recording.with_name(os.fsdecode(b"f\xe4.jsonl")))
+    output = recording.with_name("poses.jsonl")
+    done = tsgt("process", named, "--estimator", "linear", "--output", output)
+    assert done.code == 0, done.err
+    assert lines_of(output)[0]["source"] == "process: f\ufffd.jsonl"
+
+
+def test_missing_folder_is_noticed_before_the_computation(
+    tsgt: Tsgt, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which may take minutes."""
+    monkeypatch.setattr("tsgt.cli.desk.process.load", None)
+    output = recording.with_name("none") / "poses.tum"
+    done = tsgt("process", recording, "--output", output)
+    assert done.code == 1
+    assert done.err == f"error: {output}: cannot be written (No such file or directory)\n"
 
 
 def test_default_estimator_is_the_recorded_one(tsgt: Tsgt, recording: Path) -> None:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 import pytest
 from harness.drives.scene import at_rest, driving
 from harness.files.authors_files import CONSTANTS, write_prisms, write_targets, write_tracks
+from harness.inertial.imu_recording import imu_recording, shaken_drive, write
 
-from tsgt.analysis.evaluation import read_tum
+from tsgt.analysis.evaluation import inter_prism, read_tum
 from tsgt.analysis.formats import read_stationary_intervals
 from tsgt.analysis.report import (
     Findings,
@@ -27,9 +28,11 @@ from tsgt.analysis.report import (
     verdicts,
 )
 from tsgt.analysis.report.page import Headline
-from tsgt.cli.desk.report import write_page
+from tsgt.analysis.smoothing import smooth_recording
+from tsgt.cli.desk.report import assess, write_page
 from tsgt.cli.main import cli, run
 from tsgt.errors import OutputFileError
+from tsgt.estimation import build_tracks
 from tsgt.recording import load_recording
 
 if TYPE_CHECKING:
@@ -237,7 +240,7 @@ def test_report_of_one_station(tsgt: Tsgt, tmp_path: Path) -> None:
     """There are no poses and no distances; the data of the station is shown."""
     recording = recorded(tmp_path, keep="1")
     outcome = tsgt("evaluate", recording, "--report", tmp_path / "report")
-    assert outcome.code == 0
+    assert outcome.code == 3
     assert "do not trust: No poses by continuous and linear: prism 2 has no usable measurement" in outcome.out
     page = (tmp_path / "report" / "report.html").read_text(encoding="utf-8")
     assert "no usable measurement of prism 2 and prism 3" in page
@@ -325,6 +328,84 @@ def test_stations_without_common_time_have_no_motion(tmp_path: Path) -> None:
     said = report_text(findings(recording))
     assert "At no time were all prisms measured without a gap" in said
     assert "never stationary" not in said
+
+
+@pytest.fixture
+def reported(monkeypatch: pytest.MonkeyPatch) -> list[Findings]:
+    """Collect findings instead of drawing them."""
+    found: list[Findings] = []
+
+    def write(findings: Findings, folder: Path, *, on_progress: object) -> None:  # noqa: ARG001 (as the original)
+        found.append(findings)
+
+    monkeypatch.setattr("tsgt.cli.desk.report.write_report", write)
+    return found
+
+
+def short_drive(folder: Path) -> Path:
+    """Import the driving of a few seconds."""
+    path = folder / "drive.jsonl"
+    sources = ("--tracks", *write_tracks(folder, duration_s=6.0), "--prisms", write_prisms(folder))
+    called("import", "rts", *sources, "--output", path)
+    return path
+
+
+def test_report_without_poses_ends_with_the_error(
+    tsgt: Tsgt, tmp_path: Path, reported: list[Findings]
+) -> None:
+    """The same as without a report; the report is written nevertheless."""
+    arguments = ("evaluate", recorded(tmp_path, keep="1"))
+    plain, outcome = tsgt(*arguments), tsgt(*arguments, "--report", tmp_path / "report")
+    assert (plain.code, outcome.code) == (1, 3)
+    assert outcome.err == plain.err
+    assert reported
+    assert "report.html" in outcome.out
+
+
+REFERENCES = {
+    "other": "1600000000 0 0 0 0 0 0 1\n1600000100 0 0 0 0 0 0 1\n",
+    "line": "".join(f"{1_699_999_997 + i} {i} 0 0 0 0 0 1\n" for i in range(17)),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "verdict"),
+    [
+        ("other", "do not trust: No valid pose of continuous is within the time of the reference"),
+        ("line", "take care: The poses are not aligned with the reference: "),
+    ],
+)
+def test_report_without_the_comparison_ends_with_the_error(
+    tsgt: Tsgt, tmp_path: Path, reported: list[Findings], name: str, verdict: str
+) -> None:
+    """The same as without a report; a verdict says it as well."""
+    reference = tmp_path / f"{name}.tum"
+    reference.write_text(REFERENCES[name], encoding="utf-8")
+    given = ("--no-held-out", "--refine", "off", "--reference", reference, "--align", "rigid")
+    arguments = ("evaluate", short_drive(tmp_path), *given)
+    plain, outcome = tsgt(*arguments), tsgt(*arguments, "--report", tmp_path / "report")
+    assert (plain.code, outcome.code) == (1, 3)
+    assert outcome.err == plain.err
+    assert reported
+    assert verdict in outcome.out
+
+
+def test_single_prism_has_the_same_verdict_with_and_without_a_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has no distances, which is no reason for distrust."""
+    path = tmp_path / "field.jsonl"
+    recording = imu_recording(shaken_drive(12.0), stations=1)
+    write(path, recording)
+    smoothed = smooth_recording(recording, path=path, refine="off")
+    monkeypatch.setattr("tsgt.analysis.report.findings.smooth_recording", lambda *_, **__: smoothed)
+    found = collect_findings(recording, path, reference=None, with_held_out=False)
+    distances = inter_prism(recording.parameters, build_tracks(recording.parameters, recording.measurements))
+    plain = assess(recording, path, smoothed, distances, {}, found.diagnosis)
+    assert plain == verdicts(found)
+    assert "take care: No inter-prism distances: the robot has a single prism." in [
+        f"{each.level}: {each.text}" for each in plain
+    ]
 
 
 def test_odometry_needs_a_report(tsgt: Tsgt, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from tsgt.analysis.formats.trajectories.bag_files import read_bag
 from tsgt.analysis.formats.trajectories.raw import estimate_of
 from tsgt.analysis.formats.trajectories.reference_files import is_recording
 from tsgt.analysis.formats.trajectories.text_files import read_text
+from tsgt.analysis.text_file import utf8_name
 from tsgt.errors import InputFileError
 
 if TYPE_CHECKING:
@@ -44,14 +45,14 @@ def read_estimates(
     MissingExtraError
         A library for it is not installed: rosbags for bags, pymap3d for GNSS fixes.
     """
-    name = path.stem or path.name
+    name, file = utf8_name(path.stem or path.name), utf8_name(str(path))
     if is_bag(path):
         found = read_bag(path, topics)
         return tuple(
             estimate_of(
                 raw,
                 name=name if len(found) == 1 else f"{name} {topic}",
-                source=f"{path}, {topic}, {kind}",
+                source=f"{file}, {topic}, {kind}",
                 path=path,
             )
             for topic, kind, raw in found
@@ -61,4 +62,4 @@ def read_estimates(
             "holds JSON, as a recording does; export its poses: tsgt export FILE --output FILE.tum", path=path
         )
     raw = read_text(path, text_format=text_format, times=times)
-    return (estimate_of(raw, name=name, source=str(path), path=path),)
+    return (estimate_of(raw, name=name, source=file, path=path),)

@@ -82,16 +82,26 @@ def is_measured(path: Path) -> bool:
 
 def _recorded(path: Path) -> ReferencePoses:
     point = ROBOT_ORIGIN
+    parameters: Parameters | None = None  # of the run
+    set_up: Parameters | None = None  # of the last pose
     poses: dict[int, PoseRecord] = {}
     for line in read_lines(path):
         if line.type == "parameters":
-            if poses and decode_line(Parameters, line, path).reference_point != point:
+            parameters = decode_line(Parameters, line, path)
+            if poses and parameters.reference_point != point:
                 raise InputFileError("has poses of several points", path=path, line=line.number)
-            point = decode_line(Parameters, line, path).reference_point
+            point = parameters.reference_point
         elif line.type == "pose":
             pose = decode_line(PoseRecord, line, path)
-            if pose.series in _FINAL:
-                poses[pose.stamp_ns] = pose
+            if pose.series not in _FINAL:
+                continue
+            if set_up is not None and parameters is not None and not parameters.same_set_up(set_up):
+                raise InputFileError(
+                    "its set-up is not that of the pose before: runs with different set-ups were joined; use the poses of one",
+                    path=path,
+                    line=line.number,
+                )
+            poses[pose.stamp_ns], set_up = pose, parameters
     if len(poses) < _MIN_POSES:
         raise InputFileError("has fewer than two final poses; compute them with tsgt process", path=path)
     rows = [poses[stamp_ns] for stamp_ns in sorted(poses)]

@@ -15,6 +15,7 @@ from tsgt.analysis.report.sections.live import live_section
 from tsgt.analysis.report.sections.poses import estimator_section, perturbation_section, residual_section
 from tsgt.analysis.report.sections.stations import clock_section, station_section
 from tsgt.analysis.report.sections.trajectories import pose_section, reference_section
+from tsgt.analysis.text_file import utf8_name
 
 if TYPE_CHECKING:
     from tsgt.analysis.report.findings import Findings
@@ -54,7 +55,7 @@ def _recording(f: Findings) -> Section:
     """Return the facts about the recording."""
     parameters = f.recording.parameters
     rows = [
-        ("file", f.path.name),
+        ("file", utf8_name(f.path.name)),
         ("written by", f"{f.recording.header.software}, {f.recording.header.source}"),
         ("first measurement", f"{format_utc(f.start_ns)} UTC"),
         ("duration", f"{f.duration_s:.1f} s"),

@@ -88,6 +88,7 @@ def reference_section(f: Findings, axis: TimeAxis) -> Section | None:
         "Poses minus reference, in the frame of station 1, at the same instants; 2 s at both ends of the reference are "
         "excluded. Nothing is aligned, so errors of the station frames are included."
     )
+    not_aligned = (f"Not aligned: {f.problems['aligned']}.",) if "aligned" in f.problems else ()
     name, details = _shown(f)
     plot = ReportFigure(
         "reference_errors",
@@ -97,7 +98,7 @@ def reference_section(f: Findings, axis: TimeAxis) -> Section | None:
         panels_height_mm(6),
         lambda figure: draw_component_errors(figure, details.components, axis),
     )
-    return Section(title, (text,), (*_tables(f), *_alignment_and_stops(f)), (plot,))
+    return Section(title, (text, *not_aligned), (*_tables(f), *_alignment_and_stops(f)), (plot,))
 
 
 def _shown(f: Findings) -> tuple[Estimator, PoseErrorDetails]:

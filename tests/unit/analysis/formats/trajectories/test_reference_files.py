@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,6 +72,22 @@ def test_recorded_poses_equal_computed_ones(tmp_path: Path, poses: PoseBatch) ->
     assert computed.covariance is not None
     np.testing.assert_array_equal(found.covariance[found.valid], computed.covariance[found.valid])
     assert found.point == ROBOT_ORIGIN
+
+
+def test_joined_runs_with_different_set_ups_are_refused(tmp_path: Path, poses: PoseBatch) -> None:
+    """Their poses are in different frames, which no comparison shows."""
+    parameters = stationary_scene().parameters
+    first, *others = parameters.prisms
+    moved = replace(first, position_m=(0.0, 0.0, 9.0))
+    path = tmp_path / "poses.jsonl"
+    path.write_bytes(
+        recording_bytes(parameters, *poses.select(slice(0, 20)).records())
+        + recording_bytes(
+            replace(parameters, prisms=(moved, *others)), *poses.select(slice(20, None)).records()
+        )
+    )
+    with pytest.raises(InputFileError, match=r"line \d+: its set-up is not that of the pose before"):
+        read_reference_poses(path)
 
 
 def test_measured_recording_is_told(tmp_path: Path) -> None:

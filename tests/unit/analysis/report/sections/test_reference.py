@@ -57,6 +57,7 @@ def findings(poses: PoseBatch, truth: Reference) -> Any:
         reference_errors={"continuous": compare(poses, truth, CENTROID_M)},
         error_details={"continuous": error_details(poses, truth)},
         aligned_errors={},
+        problems={},
         stationary_errors={"continuous": stationary_errors(poses, truth, (), CENTROID_M).statistics()},
         poses=poses,
         point="the robot's origin",
@@ -95,6 +96,16 @@ def test_aligned_errors_fill_their_table() -> None:
     (row,) = aligned.rows
     assert len(row) == len(aligned.header)
     assert row[2] == f"{f.aligned_errors['continuous'].centroid.position_rms_mm:.1f}"
+
+
+def test_missing_alignment_is_said() -> None:
+    """With its reason; the unaligned errors are shown."""
+    f = findings(*drive())
+    f.problems = {"aligned": "the points lie in a line"}
+    section = reference_section(f, AXIS)
+    assert section is not None
+    assert "Not aligned: the points lie in a line." in section.text
+    assert len(section.tables) == 3
 
 
 def test_reference_of_another_time_is_said() -> None:

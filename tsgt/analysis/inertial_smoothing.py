@@ -199,7 +199,7 @@ def fit_with_imu(
     found = fitted(noise_scales, InertialSetupUncertainty.of(parameters))
     contradicted = contradicted_windows(found)
     windows = max((end_s - start_s) / WINDOW_S, 1.0)
-    few_prisms = len(parameters.prisms) < MIN_PRISMS
+    few_prisms = measured_prisms(observations) < MIN_PRISMS
     missing = gaps(samples, start_s, end_s)
     most = (MAX_CONTRADICTED_FEW if few_prisms else MAX_CONTRADICTED) * windows
     if len(contradicted) > max(most, 1.0):
@@ -245,10 +245,15 @@ def fit_with_imu(
     )
 
 
+def measured_prisms(observations: Observations, from_s: float = -np.inf) -> int:
+    """Return how many prisms were measured a few times, from a time on."""
+    counts = np.bincount(observations.prism[observations.time_s > from_s])
+    return int(np.count_nonzero(counts >= MIN_TOLD))
+
+
 def first_untold_s(observations: Observations, from_s: float) -> float:
     """Return when something happened that three prisms would have told; infinite if they were measured from then on."""
-    counts = np.bincount(observations.prism[observations.time_s > from_s])
-    return np.inf if np.count_nonzero(counts >= MIN_TOLD) >= MIN_PRISMS else from_s
+    return np.inf if measured_prisms(observations, from_s) >= MIN_PRISMS else from_s
 
 
 def first_move_s(fit: InertialFit) -> float:

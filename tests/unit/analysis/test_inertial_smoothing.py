@@ -12,6 +12,8 @@ from harness.files.records import START
 from harness.inertial.imu_recording import IMU, imu_recording, shaken_drive, true_positions_m
 from scipy.spatial.transform import Rotation
 
+from tsgt.analysis import inertial_smoothing
+from tsgt.analysis.inertial_smoothing import UnusedInterval
 from tsgt.analysis.smoothing import smooth_recording
 from tsgt.errors import DegenerateGeometryError, RecordingError
 from tsgt.estimation import Degradation, Reason, named_point
@@ -124,6 +126,17 @@ def test_samples_of_another_day_are_an_error_of_two_stations() -> None:
     ]
     with pytest.raises(RecordingError, match=r"do not overlap with the measurements in time; .*; --no-imu"):
         smooth(replace(recording, imu_samples=later))
+
+
+def test_third_prism_that_is_not_measured_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two stations are two, whatever the layout: poses around a contradiction are left out, too."""
+    window = UnusedInterval(10.0, 15.0, "contradiction")
+    monkeypatch.setattr(inertial_smoothing, "contradicted_windows", lambda _: [window])
+    recording = imu_recording(DRIVE)
+    measurements = [each for each in recording.measurements if each.station < 3]
+    found = smooth(replace(recording, measurements=measurements))
+    assert found.imu is not None
+    assert [(each.start_s, each.end_s) for each in found.imu.unused] == [(5.0, 20.0)]
 
 
 @pytest.mark.parametrize(("shift_s", "used"), [(1.0, 40), (-1.0, 13), (86_400.0, 0)])

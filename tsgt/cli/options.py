@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -147,6 +148,14 @@ class PointType(click.ParamType[Any]):
             return parse_reference_point(value)
         except ValueError as error:
             self.fail(str(error), param, ctx)
+
+
+def refuse_given(*names: str, because: str) -> None:
+    """Raise UsageError if one of these options was given, which have no effect ``because`` of another."""
+    context = click.get_current_context()
+    for name in names:
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--{name.replace('_', '-')} has no effect {because}")
 
 
 def resolved_point(

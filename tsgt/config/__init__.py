@@ -16,6 +16,7 @@ from tsgt.config.calibration import (
     load_prism_layout,
     load_station_calibration,
     setup_covariance,
+    with_latencies,
 )
 from tsgt.config.client import (
     Baud,
@@ -159,4 +160,5 @@ __all__ = [
     "scenario_parameters",
     "setup_covariance",
     "user_name",
+    "with_latencies",
 ]

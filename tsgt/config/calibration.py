@@ -11,7 +11,7 @@ from tsgt.config.setup import ImuMountingFile, PrismLayoutFile, StationFramesFil
 from tsgt.model import ImuParameters, SetupCovariance, TargetResidual
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from tsgt.config.setup import CovarianceTable, StationFrame
@@ -156,7 +156,20 @@ def setup_covariance(
     if not known:  # The IMU's alone would say that the others are exact
         return None
     of_imu = _restricted(imu, {"imu"})
-    known += [] if of_imu is None else [of_imu]
+    return _joined(known if of_imu is None else [*known, of_imu])
+
+
+def with_latencies(
+    covariance: SetupCovariance, known: SetupCovariance | None, stations: Iterable[int]
+) -> SetupCovariance:
+    """Join the latencies of these stations, as known from elsewhere, to a covariance without them."""
+    wanted = {f"station{number}.latency" for number in stations}
+    kept = _selected(known, [name in wanted for name in known.components]) if known else None
+    return covariance if kept is None else _joined([covariance, kept])
+
+
+def _joined(known: Sequence[SetupCovariance]) -> SetupCovariance:
+    """Join covariances of components that are not correlated with those of the others."""
     components = [name for part in known for name in part.components]
     rows: list[tuple[float, ...]] = []
     before = 0
@@ -171,7 +184,12 @@ def _restricted(covariance: SetupCovariance | None, owners: set[str]) -> SetupCo
     """Keep the components of these stations or prisms."""
     if covariance is None:
         return None
-    kept = [i for i, name in enumerate(covariance.components) if name.partition(".")[0] in owners]
+    return _selected(covariance, [name.partition(".")[0] in owners for name in covariance.components])
+
+
+def _selected(covariance: SetupCovariance, wanted: Sequence[bool]) -> SetupCovariance | None:
+    """Keep components, if any."""
+    kept = [i for i, is_wanted in enumerate(wanted) if is_wanted]
     if not kept:
         return None
     return SetupCovariance(

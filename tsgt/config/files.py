@@ -107,7 +107,7 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path}: larger than {_MAX_BYTES // 1_000_000} MB; name a configuration", path=path
         )
     try:
-        raw = tomllib.loads(content.decode("utf-8"))
+        raw = tomllib.loads(content.decode("utf-8-sig"))
         # Validation and messages need it; fails for huge hexadecimal numbers and long dotted keys.
         json.dumps(raw, default=str)
     except UnicodeDecodeError as error:

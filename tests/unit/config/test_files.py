@@ -189,6 +189,14 @@ def test_deep_nesting_and_huge_numbers(text: str, tmp_path: Path) -> None:
     assert len(str(error.value)) < len(str(path)) + 200
 
 
+def test_byte_order_mark(tmp_path: Path) -> None:
+    """Editors of Windows write one."""
+    path = tmp_path / "a.toml"
+    path.write_text('\ufeffkind = "nothing"', encoding="utf-8")
+    with pytest.raises(ConfigError, match="kind"):
+        load_any(path)
+
+
 def test_file_of_another_kind(tmp_path: Path) -> None:
     """The error names the expected kind."""
     path = tmp_path / "scenario.toml"

@@ -46,7 +46,7 @@ class TargetCollection:
         Raises InputFileError if it is of another kind, has an invalid line, or cannot be read.
         """
         try:
-            lines = self.path.read_text(encoding="utf-8").splitlines()
+            lines = self.path.read_text(encoding="utf-8-sig").splitlines()
         except FileNotFoundError:
             return
         except UnicodeDecodeError as error:

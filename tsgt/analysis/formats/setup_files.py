@@ -69,7 +69,7 @@ def write_station_frames(
         table: dict[str, Any] = {"T_station1_station": T.tolist()}
         if station in rms_m:
             table["rms_mm"] = _to_mm(rms_m[station])
-        if latencies_ms is not None:
+        if latencies_ms is not None and station in latencies_ms:
             table["latency_ms"] = round(float(latencies_ms[station]), 6)
         if instrument_errors is not None and station in instrument_errors:
             table |= instrument_errors[station].table()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import stat
 import struct
 import time
 from contextlib import suppress
@@ -13,12 +14,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from tsgt.cli.options import path_type
-from tsgt.config import MasterConfig, load, missing_setup_files, parameters
-from tsgt.errors import TsgtError
-from tsgt.master.reload import RELOAD_SIGNAL
-from tsgt.recording import SETUP_START, SetupRecord, encode_line
+from tsgt.config import MasterConfig, load, missing_setup_files, parameters, parameters_in_force
+from tsgt.errors import ConfigError, OutputFileError, TsgtError
+from tsgt.master.reload import RELOAD_SIGNAL, usable_setup
+from tsgt.recording import SETUP_START, SetupRecord, encode_line, sync_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 RESPONSE_TIMEOUT_S = 20.0
@@ -49,6 +51,54 @@ def output_of(output: Path | None, master: Path | None, file: SetupFile) -> Path
     return getattr(load(master, MasterConfig).setup, file)  # type: ignore[no-any-return]
 
 
+def write_setup(output: Path, master: Path | None, file: SetupFile, write: Callable[[Path], None]) -> None:
+    """Write a set-up file; ``write`` writes it to a path. That of a master keeps its owner and permissions.
+
+    Raises TsgtError if the master could not use it, though it can use the one before, which then stays.
+    """
+    if master is None:
+        write(output)
+        return
+    config = load(master, MasterConfig)
+    target = output.resolve()
+    new = target.with_name(f".{target.name}.new")
+    try:
+        write(new)
+        problem = _problem(config.model_copy(update={"setup": config.setup.model_copy(update={file: new})}))
+        if problem is not None and _problem(config) is None:
+            raise TsgtError(
+                f"{output} is not replaced, because the master could not use the new one: "
+                f"{problem.replace(str(new), 'the new file')}; measure what is missing, or write it elsewhere with --output"
+            )
+        _share(new, target)
+        new.replace(target)
+        sync_folder(target)
+    except OSError as error:
+        raise OutputFileError(f"cannot be written ({error.strerror})", path=output) from error
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def _problem(config: MasterConfig) -> str | None:
+    """Return why a master cannot use its set-up files; None: it can."""
+    try:
+        usable_setup(lambda: parameters_in_force(config))
+    except ConfigError as error:
+        return str(error)
+    return None
+
+
+def _share(new: Path, old: Path) -> None:
+    """Give a file the owner and the permissions of the one that it replaces; without one the master, another user, may read it."""
+    if not old.exists():
+        new.chmod(0o644)
+        return
+    state = old.stat()
+    new.chmod(stat.S_IMODE(state.st_mode))
+    with suppress(PermissionError):  # only root may
+        os.chown(new, state.st_uid, state.st_gid)
+
+
 def apply_setup(master: Path) -> str:
     """Have the running master read its set-up files; return in a sentence what it has done.
 
@@ -63,6 +113,10 @@ def apply_setup(master: Path) -> str:
         except OSError as error:
             if isinstance(error, PermissionError):
                 raise TsgtError(f"{config.stream.socket}: {error.strerror}; try sudo") from error
+            if problem := _problem(config):
+                raise TsgtError(
+                    f"the file is written, but the master, which is not running, cannot use its set-up: {problem}"
+                ) from error
             return "the master is not running; it uses the file from its next start on"
         size = struct.calcsize("3i")
         pid, _, _ = struct.unpack("3i", stream.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))

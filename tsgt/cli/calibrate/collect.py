@@ -103,7 +103,7 @@ async def collect_targets(
         if reply is None or key == "q" or (cell is None and key == ""):
             return
         if key == "r":
-            _repeat(collection, operator, arguments, last)
+            skipped.discard(_repeat(collection, operator, arguments, last))
         elif cell is None or arguments or key not in ("", "s"):
             operator.say(f"unknown key {reply!r}")
         elif key == "s":
@@ -118,22 +118,23 @@ async def collect_targets(
 
 def _repeat(
     collection: TargetCollection, operator: Operator, arguments: Sequence[str], last: StationTarget | None
-) -> None:
-    """Delete the last target, or the one with these numbers: ``[station] target``."""
+) -> StationTarget | None:
+    """Delete the last target, or the one with these numbers, ``[station] target``; return which."""
     if (
         not all(number.isdecimal() for number in arguments)
         or len(arguments) > 2
         or (len(arguments) < 2 and last is None)
     ):
         operator.say("which one? Type r, station and target, for example r 2 5")
-        return
+        return None
     given = [int(number) for number in arguments]
     station, target = (*(last or ())[: 2 - len(given)], *given)
     if not collection.remove(station, target):
         operator.say(f"station {station} has not measured target {target} yet")
-        return
+        return None
     _write(collection)
     operator.say(f"station {station}, target {target} is deleted; aim at it again")
+    return station, target
 
 
 def _write(collection: TargetCollection) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tsgt.analysis.calibration import layout_covariance, solve_prisms
 from tsgt.analysis.formats import read_prism_file, write_prism_layout
-from tsgt.cli.calibrate.apply import apply_option, apply_setup, output_of
+from tsgt.cli.calibrate.apply import apply_option, apply_setup, output_of, write_setup
 from tsgt.cli.calibrate.check import check
 from tsgt.cli.calibrate.collect import collect
 from tsgt.cli.calibrate.frame_output import (
@@ -114,13 +114,17 @@ def prisms(
     failed = _warn(solved.body)
     if output is not None and solved.body.consistent:
         options = given(TARGET_CONSTANT, target_constant_mm) + given(PRISM_CONSTANT, prism_constant_mm)
-        write_prism_layout(
-            output,
-            positions,
-            sigmas,
-            comment=f"written by tsgt calibrate prisms {file}{options}",
-            covariance=layout_covariance(solved),
-        )
+
+        def write(path: Path) -> None:
+            write_prism_layout(
+                path,
+                positions,
+                sigmas,
+                comment=f"written by tsgt calibrate prisms {file}{options}",
+                covariance=layout_covariance(solved),
+            )
+
+        write_setup(output, master, "prism_layout", write)
         click.echo(f"{output}: {len(positions)} prisms with their joint covariance written", err=True)
         if master is not None:
             click.echo(apply_setup(master), err=True)

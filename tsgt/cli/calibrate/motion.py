@@ -13,8 +13,22 @@ from tsgt.analysis.calibration import calibrate_recording
 from tsgt.analysis.formats import InstrumentErrors, write_prism_layout, write_station_frames
 from tsgt.analysis.validation import check_time_span, plausible_measurements
 from tsgt.cli.model_options import add_options
-from tsgt.cli.options import FiniteRange, OutputFile, json_option, keep_going_option, recording_argument
-from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite, report_problem
+from tsgt.cli.options import (
+    FiniteRange,
+    OutputFile,
+    json_option,
+    keep_going_option,
+    recording_argument,
+    refuse_given,
+)
+from tsgt.cli.output import (
+    CHECK_FAILED,
+    print_json,
+    print_table,
+    refuse_overwrite,
+    report_problem,
+    require_folder,
+)
 from tsgt.cli.recordings import calibrated
 from tsgt.geometry.motion_calibration import SetupPrior, unobservable_directions
 from tsgt.model import SetupCovariance
@@ -37,6 +51,9 @@ _SIGMAS = {
     "--latency-sigma-ms": (100.0, "One sigma of the latencies."),
     "--prism-sigma-mm": (5.0, "One sigma of the prism positions."),
 }
+
+
+_OF_KNOWN_FRAMES = "frame_sigma_mm", "frame_sigma_mrad", "latency_sigma_ms"
 
 
 @click.command()
@@ -99,6 +116,7 @@ def motion(
     """
     for path in (output, prism_output):
         refuse_overwrite([recording], path)
+        require_folder(path)
     if prism_output is not None and not estimate_prisms:
         raise click.UsageError("--prism-output needs --estimate-prisms; without it the layout is fixed")
     if output is not None and prism_output is not None and output.resolve() == prism_output.resolve():
@@ -106,6 +124,12 @@ def motion(
             "--output and --prism-output are the same file; the prisms would replace the frames"
         )
     known = frames == "known"
+    if not known:
+        refuse_given(*_OF_KNOWN_FRAMES, because="with --initial-frames unknown")
+    if not latency:
+        refuse_given("latency_sigma_ms", because="with --no-latency")
+    if not estimate_prisms:
+        refuse_given("prism_sigma_mm", because="without --estimate-prisms")
     loaded = load_recording(recording, keep_going=keep_going, on_problem=report_problem)
     loaded = calibrated(loaded, recording)
     check_time_span(loaded.parameters, plausible_measurements(loaded), recording)

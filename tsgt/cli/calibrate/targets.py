@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,7 +18,7 @@ from tsgt.analysis.calibration import (
     unidentified_text,
 )
 from tsgt.analysis.formats import read_target_file, write_station_frames
-from tsgt.cli.calibrate.apply import apply_option, apply_setup, output_of
+from tsgt.cli.calibrate.apply import apply_option, apply_setup, output_of, write_setup
 from tsgt.cli.calibrate.frame_output import (
     TARGET_CONSTANT,
     file_argument,
@@ -30,7 +31,14 @@ from tsgt.cli.calibrate.frame_output import (
 )
 from tsgt.cli.options import FiniteRange, constant_m, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json, print_table, refuse_overwrite
-from tsgt.config import MasterConfig, load
+from tsgt.config import (
+    MasterConfig,
+    StationCalibration,
+    load,
+    load_station_calibration,
+    with_latencies,
+)
+from tsgt.errors import ConfigError
 from tsgt.geometry.target_calibration import InstrumentError
 
 if TYPE_CHECKING:
@@ -123,16 +131,21 @@ def targets(
     notes = [*measured.skipped, *target_notes(solved)]
     options = given(TARGET_CONSTANT, target_constant_mm)
     options += f" --weights {weights}{' --levelled' if levelled else ''}"
-    command = f"tsgt calibrate targets {file}{options}"
+    command = f"tsgt calibrate targets {shlex.quote(str(file))}{options}"
     excluded = _exclusions_text(exclude or ())
     options += f" --exclude {excluded}" if excluded else ""
     options += given("--max-residual-mm", max_residual_mm)
     if output is not None and solved.consistent:
-        _write(output, solved, comment=f"written by tsgt calibrate targets {file}{options}")
+        before = StationCalibration({}) if master is None else _before(output)
+        comment = f"written by tsgt calibrate targets {file}{options}"
+        notes += _write(output, master, solved, before, comment=comment)
         notes += _scale_notes(output, solved)
     if master is not None and solved.consistent:
         notes += _uncorrected_notes(file, master, solved)
-    failures = _failures(solved, command, excluded, output)
+    destination = f" --output {shlex.quote(str(output))}" if output is not None else ""
+    if master is not None:
+        destination = f" --apply {shlex.quote(str(master))}"
+    failures = _failures(solved, command, excluded, destination)
     written = _written(solved, output)
     if as_json:
         print_json(_json(solved, notes, written, output))
@@ -148,16 +161,42 @@ def targets(
     return CHECK_FAILED if failures else 0
 
 
-def _write(output: Path, solved: TargetCalibration, *, comment: str) -> None:
-    write_station_frames(
-        output,
-        {1: np.eye(4)} | {station: frame.T for station, frame in solved.frames.items()},
-        {station: frame.rms_m for station, frame in solved.frames.items()},
-        comment=comment,
-        targets={station: target_residuals(frame) for station, frame in solved.frames.items()},
-        instrument_errors=solved.instrument_errors(),
-        covariance=solved.covariance,
-    )
+def _before(output: Path) -> StationCalibration:
+    """Return the calibration that the set-up file of a master has; none if there is no such file, or it is invalid."""
+    try:
+        return load_station_calibration(output)
+    except ConfigError:
+        return StationCalibration({})
+
+
+def _write(
+    output: Path, master: Path | None, solved: TargetCalibration, before: StationCalibration, *, comment: str
+) -> list[str]:
+    """Write the set-up file, with the latencies of the one before: targets do not tell them. Return notes."""
+    frames = {1: np.eye(4)} | {station: frame.T for station, frame in solved.frames.items()}
+    latencies_ms = {
+        number: setup.latency_ns / 1e6
+        for number, setup in before.stations.items()
+        if setup.latency_ns is not None and number in frames
+    }
+
+    def write(path: Path) -> None:
+        write_station_frames(
+            path,
+            frames,
+            {station: frame.rms_m for station, frame in solved.frames.items()},
+            comment=comment,
+            latencies_ms=latencies_ms,
+            targets={station: target_residuals(frame) for station, frame in solved.frames.items()},
+            instrument_errors=solved.instrument_errors(),
+            covariance=with_latencies(solved.covariance, before.covariance, latencies_ms),
+        )
+
+    write_setup(output, master, "station_frames", write)
+    return [
+        f"{output} keeps the latency of station {number}, {value_ms:.3g} ms, which targets do not tell"
+        for number, value_ms in sorted(latencies_ms.items())
+    ]
 
 
 def _scale_notes(output: Path, solved: TargetCalibration) -> list[str]:
@@ -196,7 +235,7 @@ def _exclusions_text(exclude: tuple[Exclusion, ...]) -> str:
     return ",".join(f"{target}" if station is None else f"{station}:{target}" for station, target in exclude)
 
 
-def _failures(solved: TargetCalibration, command: str, excluded: str, output: Path | None) -> list[str]:
+def _failures(solved: TargetCalibration, command: str, excluded: str, destination: str) -> list[str]:
     """Return one sentence per failed check, with value and limit; a last one says how to go on if nothing is written."""
     sentences = []
     for check in solved.checks:
@@ -226,12 +265,11 @@ def _failures(solved: TargetCalibration, command: str, excluded: str, output: Pa
                 f"{whose}: the targets are inconsistent: {check.name.replace('_', ' ')} {check.value:.2f}, limit {check.limit:.2f}"
             )
     if not solved.consistent:
-        sentences.append(_way_on(solved, command, excluded, output))
+        sentences.append(_way_on(solved, command, excluded, destination))
     return sentences
 
 
-def _way_on(solved: TargetCalibration, command: str, excluded: str, output: Path | None) -> str:
-    destination = "" if output is None else f" --output {output}"
+def _way_on(solved: TargetCalibration, command: str, excluded: str, destination: str) -> str:
     if suspects := suspect_exclusions(solved):
         left_out = ",".join(filter(None, (excluded, *suspects)))
         return f"measure the suspect targets again, or leave them out: {command} --exclude {left_out}{destination}"

@@ -13,7 +13,7 @@ import click
 
 from tsgt import service
 from tsgt.cli.model_options import model_option
-from tsgt.cli.options import json_option
+from tsgt.cli.options import FiniteRange, json_option
 from tsgt.cli.output import CHECK_FAILED, print_json
 from tsgt.cli.radio.options import Modem, modem_options, wiring_options
 from tsgt.clock import SystemClock
@@ -108,7 +108,7 @@ def _byte(_context: click.Context, _parameter: click.Parameter, value: str) -> i
 @wiring_options
 @click.option(
     "--distance-m",
-    type=click.FloatRange(1, 1e6),
+    type=FiniteRange(1, 1e6),
     default=100.0,
     help="Distance of simulated radios in free space.",
 )

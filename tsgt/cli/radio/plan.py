@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tsgt.cli.model_options import model_option
-from tsgt.cli.options import FiniteRange, json_option
+from tsgt.cli.options import FiniteRange, json_option, refuse_given
 from tsgt.cli.output import print_json, print_table
 from tsgt.cli.radio.options import Modem, modem_options
 from tsgt.config import (
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 _CLASSIC = ClassicMasterConfig(kind="classic")
 _SUPERFRAME = SuperframeMasterConfig(kind="superframe")
+_OF_SUPERFRAME = "start_jitter_ms", "turnaround_ms", "no_phase_lock"
 
 _PAPER_MHZ = 905.0
 _VIOLATED = 3
@@ -147,6 +148,8 @@ def plan_command(
         )
     settings = _settings(modem, region, frequency_mhz, power_dbm, antenna_gain_dbi)
     spoken: MasterProtocol = _CLASSIC
+    if protocol == "classic":
+        refuse_given(*_OF_SUPERFRAME, because="with --protocol classic")
     if protocol == "superframe":
         spoken = _SUPERFRAME.model_copy(
             update={

@@ -299,6 +299,15 @@ async def test_keys_skip_repeat_and_reject(tmp_path: Path) -> None:
     assert "station 1 has not measured target 9 yet" in script.said
 
 
+async def test_skipped_target_that_is_repeated_is_asked_for(tmp_path: Path) -> None:
+    """The next measurement is of the target that the operator was told to aim at."""
+    async with aimed(tmp_path) as (field, instruments):
+        script = Script(instruments, "", "s", "r 1 1", "", "q")
+        collection = await collected(field, script, tmp_path / "targets.csv", repeats=2)
+    assert [question.split(":")[0] for question in script.questions][3] == "station 1, target 1"
+    assert [collection.count(1, t) for t in (1, 2)] == [1, 0]
+
+
 @pytest.mark.parametrize("speaks", BOTH)
 @pytest.mark.parametrize("stop", ["q", None, "cancel"])
 @pytest.mark.slow
@@ -352,6 +361,14 @@ async def test_progress_shows_counts_and_residuals(
     assert rows[0].split() == ["1", "1", "1", "-", "0.2"]
     assert rows[3].split() == ["4", "X", "-", "-"]
     assert verdict.startswith("station 2: rms 0.4 mm")
+
+
+def test_file_with_a_byte_order_mark_is_continued(tmp_path: Path) -> None:
+    """Spreadsheets write one."""
+    path = tmp_path / "targets.csv"
+    collection = TargetCollection(path, STATIONS, [1, 2, 3])
+    path.write_text("\ufeff" + collection.text(), encoding="utf-8")
+    collection.resume()
 
 
 @pytest.mark.parametrize("text", ["station,target\n", "junk", ""])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from harness.files.target_files import write_master, write_targets
 from harness.instruments.target_field import TargetField
 
 from tsgt.config import StationFramesFile, load, load_prism_layout, load_station_calibration
@@ -50,27 +51,6 @@ def falsified(markers: Path, folder: Path, station: int, target: int, extra_m: f
             cells[5] = repr(float(cells[5]) + extra_m)
         lines.append(" , ".join(cells))
     path = folder / "falsified.txt"
-    path.write_text("\n".join(lines), encoding="utf-8")
-    return path
-
-
-def written_to(field: TargetField, folder: Path, *, ppm: tuple[float, ...] = ()) -> Path:
-    """Write the measurements of a simulated field of targets to a file; ``ppm``: atmospheric corrections of the stations."""
-    readings = field.measure()
-    rows = zip(
-        readings.station + 1,
-        readings.target + 1,
-        (readings.horizontal_rad % (2 * np.pi)).tolist(),
-        readings.zenith_rad.tolist(),
-        readings.distance_m.tolist(),
-        strict=True,
-    )
-    lines = ["station,target,horizontal_angle_rad,zenith_angle_rad,slope_distance_m"]
-    lines += [",".join(map(str, row)) for row in rows]
-    if ppm:
-        columns = ["atmospheric_ppm", *(f"{ppm[station]}" for station in readings.station.tolist())]
-        lines = [f"{line},{column}" for line, column in zip(lines, columns, strict=True)]
-    path = folder / "simulated.csv"
     path.write_text("\n".join(lines), encoding="utf-8")
     return path
 
@@ -226,7 +206,7 @@ def test_excluded_target_is_the_way_on(tsgt: Tsgt, tmp_path: Path, weights: str)
 def test_tripod_that_moved_names_the_way_on(tsgt: Tsgt, tmp_path: Path) -> None:
     """The command that is printed leaves out what was measured before it moved, and succeeds."""
     moved = (1, 4, np.array([0.006, -0.004, 0.003, 2e-4]))
-    path = written_to(TargetField(rng=np.random.default_rng(2), targets=9, moved_tripod=moved), tmp_path)
+    path = write_targets(TargetField(rng=np.random.default_rng(2), targets=9, moved_tripod=moved), tmp_path)
     done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT)
     assert done.code == 3
     assert "--exclude 2:1,2:2,2:3,2:4" in done.err.splitlines()[-1]
@@ -256,7 +236,7 @@ def test_instrument_error_is_written(tsgt: Tsgt, tmp_path: Path) -> None:
     field = TargetField(
         rng=np.random.default_rng(1), errors={(1, InstrumentError.VERTICAL_INDEX): 3e-4}, both_faces=True
     )
-    path, output = written_to(field, tmp_path), tmp_path / "frames.toml"
+    path, output = write_targets(field, tmp_path), tmp_path / "frames.toml"
     done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--output", output)
     assert done.code == 0
     assert "station 2: the residuals look like a vertical index error" in done.err
@@ -273,7 +253,7 @@ def test_common_scale_leaves_the_configured_one_in_force(tsgt: Tsgt, tmp_path: P
         rng=np.random.default_rng(1), errors={(row, InstrumentError.RANGE_SCALE): 6e-5 for row in range(3)}
     )
     output = tmp_path / "frames.toml"
-    done = tsgt("calibrate", "targets", written_to(field, tmp_path), *TARGET_CONSTANT, "--output", output)
+    done = tsgt("calibrate", "targets", write_targets(field, tmp_path), *TARGET_CONSTANT, "--output", output)
     assert done.code == 0
     assert "replaces" not in done.err
     stations = load_station_calibration(output).stations
@@ -287,7 +267,7 @@ def test_scale_that_is_a_cause_is_written_with_a_note(tsgt: Tsgt, tmp_path: Path
     field = TargetField(rng=np.random.default_rng(2), errors={(1, InstrumentError.RANGE_SCALE): 1e-4}, far=3)
     output = tmp_path / "frames.toml"
     done = tsgt(
-        "calibrate", "targets", written_to(field, tmp_path), *TARGET_CONSTANT, "--output", output, "--json"
+        "calibrate", "targets", write_targets(field, tmp_path), *TARGET_CONSTANT, "--output", output, "--json"
     )
     assert done.code == 0
     stations = load_station_calibration(output).stations
@@ -302,7 +282,7 @@ def test_scale_that_is_a_cause_contains_the_correction_of_the_file(tsgt: Tsgt, t
     field = TargetField(
         rng=np.random.default_rng(2), errors={(1, InstrumentError.RANGE_SCALE): 1.3e-4}, far=3
     )
-    path, output = written_to(field, tmp_path, ppm=(0.0, 30.0, 0.0)), tmp_path / "frames.toml"
+    path, output = write_targets(field, tmp_path, ppm=(0.0, 30.0, 0.0)), tmp_path / "frames.toml"
     assert tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--output", output).code == 0
     assert load_station_calibration(output).stations[2].range_scale_ppm == pytest.approx(130, abs=15)
 
@@ -312,19 +292,9 @@ def test_targets_without_the_correction_of_the_master_are_named(
     tsgt: Tsgt, tmp_path: Path, ppm: tuple[float, ...], *, named: bool
 ) -> None:
     """Frames and poses would differ in scale: 40 ppm are 4 mm at 100 m."""
-    path = written_to(TargetField(rng=np.random.default_rng(2)), tmp_path, ppm=ppm)
+    path = write_targets(TargetField(rng=np.random.default_rng(2)), tmp_path, ppm=ppm)
     master = tmp_path / "master.toml"
-    stations = "".join(
-        f"[[stations]]\nstation = {n}\nprism = {n}\nprism_constant_mm = 0.0\n"
-        f"atmospheric_ppm = {40.0 if n == 2 else 0.0}\n"
-        for n in (1, 2, 3)
-    )
-    master.write_text(
-        f'kind = "master"\n{stations}[setup]\nstation_frames = "frames.toml"\nprism_layout = "layout.toml"\n'
-        '[radio]\nkind = "simulated"\nair_socket = "air.sock"\nname = "master"\nfrequency_mhz = 905.0\n'
-        'spreading_factor = 9\n[protocol]\nkind = "classic"\n[stream]\nsocket = "poses.sock"\n',
-        encoding="utf-8",
-    )
+    write_master(master, ppm=(0.0, 40.0, 0.0))
     done = tsgt("calibrate", "targets", path, *TARGET_CONSTANT, "--apply", master)
     assert done.code == 0, done.err
     assert ("station 2: " in done.err and "has atmospheric_ppm = 40" in done.err) is named

@@ -106,6 +106,37 @@ def test_noise_of_zero_is_refused(recording: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (
+            ("--initial-frames", "unknown", "--frame-sigma-mm", 3),
+            "--frame-sigma-mm has no effect with --initial-frames",
+        ),
+        (("--initial-frames", "unknown", "--latency-sigma-ms", 3), "--latency-sigma-ms has no effect"),
+        (("--no-latency", "--latency-sigma-ms", 3), "--latency-sigma-ms has no effect with --no-latency"),
+        (("--prism-sigma-mm", 3), "--prism-sigma-mm has no effect without --estimate-prisms"),
+    ],
+)
+def test_sigmas_without_effect_are_refused(
+    tsgt: Tsgt, recording: Path, arguments: tuple[object, ...], complaint: str
+) -> None:
+    """The result would pass for one with this prior."""
+    done = tsgt("calibrate", "motion", recording, *arguments)
+    assert done.code == 2
+    assert complaint in done.err
+
+
+def test_missing_folder_is_noticed_before_the_calibration(
+    tsgt: Tsgt, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes minutes."""
+    monkeypatch.setattr("tsgt.cli.calibrate.motion.calibrate_recording", None)
+    done = tsgt("calibrate", "motion", recording, "--output", tmp_path / "missing" / "frames.toml")
+    assert done.code == 1
+    assert "cannot be written (No such file or directory)" in done.err
+
+
 def test_text_names_the_stations(tsgt: Tsgt, recording: Path) -> None:
     """Without --json the output is a table."""
     done = tsgt(

@@ -150,6 +150,7 @@ def test_simulated_ping_is_deterministic(tsgt: Tsgt) -> None:
         (("--simulated", "--frequency-mhz", "nan"), "--frequency-mhz"),
         (("--simulated", "--backend", "wiringpi"), "--backend"),
         (("--simulated", "--spi-hz", 10_000_001), "--spi-hz"),
+        (("--simulated", "--distance-m", "nan"), "--distance-m"),
         (("--simulated", "--sync-word", "0x100"), "--sync-word"),
         (("--simulated", "--sync-word", "lora"), "--sync-word"),
     ],

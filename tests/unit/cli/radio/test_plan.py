@@ -145,6 +145,8 @@ def test_20_dbm_is_a_warning(tsgt: Tsgt) -> None:
     ("arguments", "complaint"),
     [
         ((*CLASSIC, 10), "--stations 10: classic supports at most 9"),
+        ((*CLASSIC, 3, "--no-phase-lock"), "--no-phase-lock has no effect with --protocol classic"),
+        ((*CLASSIC, 3, "--turnaround-ms", 50), "--turnaround-ms has no effect"),
         ((*SUPERFRAME, 17), "--stations"),
         ((*SUPERFRAME, 3, "--loss", 1), "--loss"),
         ((*SUPERFRAME, 3, "--rate-hz", 0), "--rate-hz"),

@@ -14,7 +14,7 @@ from tsgt.setup.answers import (
     differing_answers,
     of_mission,
 )
-from tsgt.setup.configuration import ConfigurationState, State, compare_configuration
+from tsgt.setup.configuration import ConfigurationState, State, compare_configuration, uses_network
 from tsgt.setup.mission import Mission, MissionError, decode_mission, encode_mission, hand_over_lines
 from tsgt.setup.probe import DEFAULT_BAUD, FoundInstrument, Ports, WiringSearch, find_instruments, find_radio
 from tsgt.setup.steps import (
@@ -23,6 +23,7 @@ from tsgt.setup.steps import (
     MASTER,
     USER,
     Role,
+    before_restart,
     clock_step,
     configuration_step,
     journal_step,
@@ -61,6 +62,7 @@ __all__ = [
     "System",
     "WiringSearch",
     "WriteFile",
+    "before_restart",
     "carry_out",
     "client_text",
     "clock_step",
@@ -82,4 +84,5 @@ __all__ = [
     "start_step",
     "system_step",
     "user_step",
+    "uses_network",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -37,3 +38,13 @@ def compare_configuration(before: str | None, new: str, name: str) -> Configurat
     )
     state = State.FROM_SETUP if sealed_by_setup(before) else State.EDITED
     return ConfigurationState(state, tuple(lines))
+
+
+def uses_network(text: str) -> bool | None:
+    """Whether the instrument of a configuration is in the network; None if it does not say so: a bridge, a master."""
+    try:
+        instrument = tomllib.loads(text).get("instrument")
+    except tomllib.TOMLDecodeError:
+        return None
+    port = instrument.get("port") if isinstance(instrument, dict) else None
+    return port.startswith("tcp://") if isinstance(port, str) else None

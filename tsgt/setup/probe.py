@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -26,6 +26,7 @@ Backend = Literal["gpiod", "rpi-gpio"]
 DEFAULT_BAUD: Final = 115_200
 BACKENDS: Final[tuple[Backend, ...]] = ("gpiod", "rpi-gpio")
 HAT_NSS_PIN: Final = 25
+HAT_RESET_PIN: Final = 17
 KERNEL_NSS: Final = -1
 DIO0_PINS: Final = (4, 22)  # of the HAT, and of a bare module wired as docs/how-to/wire-the-radio.md says
 
@@ -55,12 +56,12 @@ class Ports:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WiringSearch:
-    """Wirings to try; None: what a radio may be wired to. The reset pin is the Dragino HAT's."""
+    """Wirings to try, by what was asked for; None: what a radio may be wired to, with the reset pin of the Dragino HAT."""
 
     backend: Backend | None = None
     spi_device: str | None = None
     nss_pin: int | None = None
-    reset_pin: int = 17
+    reset_pin: int | None = None
     dio0_pin: int | None = None
     gpio_chip: str | None = None
 
@@ -74,16 +75,36 @@ class WiringSearch:
         dio0_pins = DIO0_PINS if self.dio0_pin is None else (self.dio0_pin,)
         used = devices if self.spi_device is None else (self.spi_device,)
         for backend, nss_pin, device, dio0_pin in product(backends, nss_pins, used, dio0_pins):
-            bus, _, select = device.removeprefix("spidev").partition(".")
+            bus, select = _bus_and_select(device)
             yield WiringConfig(
                 backend=backend,
-                spi_bus=int(bus),
-                spi_device=int(select),
-                reset_pin=self.reset_pin,
+                spi_bus=bus,
+                spi_device=select,
+                reset_pin=HAT_RESET_PIN if self.reset_pin is None else self.reset_pin,
                 dio0_pin=dio0_pin,
                 nss_pin=nss_pin,
                 gpio_chip=self.gpio_chip if backend == "gpiod" else None,
             )
+
+    def applied_to(self, before: WiringConfig) -> WiringConfig:
+        """Return the wiring of a configuration with what was asked for."""
+        names = ("backend", "nss_pin", "reset_pin", "dio0_pin", "gpio_chip")
+        asked = {name: value for name in names if (value := getattr(self, name)) is not None}
+        if self.spi_device is not None:
+            asked["spi_bus"], asked["spi_device"] = _bus_and_select(self.spi_device)
+        if asked.get("backend", before.backend) != "gpiod":
+            asked["gpio_chip"] = None
+        return before.model_copy(update=asked)
+
+    def completed_from(self, before: WiringConfig) -> WiringSearch:
+        """Return the search with what no radio tells, where it was not asked for, from the wiring of a configuration."""
+        applied = self.applied_to(before)
+        return replace(self, reset_pin=applied.reset_pin, gpio_chip=applied.gpio_chip)
+
+
+def _bus_and_select(device: str) -> tuple[int, int]:
+    bus, _, select = device.removeprefix("spidev").partition(".")
+    return int(bus), int(select)
 
 
 async def find_radio(

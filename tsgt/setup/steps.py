@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import count
 from typing import TYPE_CHECKING, Final, Literal
@@ -50,6 +50,14 @@ class Role:
     def config(self) -> str:
         """Name of its configuration."""
         return f"/etc/tsgt/{self.kind}.toml"
+
+    @property
+    def restart_due(self) -> str:
+        """Name of the file that exists while the service runs with something older than what is installed.
+
+        It outlives an interrupted setup, and is gone after a boot, which starts the service anew.
+        """
+        return f"/run/tsgt-{self.kind}.restart-due"
 
 
 CLIENT: Final = Role("station", "client")
@@ -165,7 +173,7 @@ def key_step(system: System, key: bytes | None, *, replace: bool = False) -> Ste
             return Step(name="key", detail=f"{KEY} is there and stays")
         return _problem(
             "key",
-            f"{KEY} is missing: give the mission's text, --mission; `sudo tsgt setup mission` on the master shows it",
+            f"{KEY} is missing: install the mission's key there; `tsgt radio key` makes a new one, and says how",
         )
     if before == key.hex():
         return Step(name="key", detail=f"{KEY} is the key of this mission")
@@ -207,19 +215,22 @@ def configuration_step(system: System, role: Role, new: str, *, replace: bool) -
     return Step(name="configuration", detail=role.config, changes=tuple(changes))
 
 
-def services_step(system: System, role: Role, *, network: bool = False) -> Step:
-    """Install unit and udev rules, and let the service start at boot; ``network``: its instrument is in the network."""
+def services_step(system: System, role: Role, *, network: bool | None = None) -> Step:
+    """Install unit and udev rules, and let the service start at boot.
+
+    ``network``: whether its instrument is in the network, which it may use then; None leaves that as it is.
+    """
     unit: list[Change] = [*_installed(system, "systemd", role.unit)]
     text = _content("systemd", "network-instrument.conf")
     name = f"/etc/systemd/system/{role.unit}.d/network-instrument.conf"
-    is_ours = system.read(name) == text
-    if network and not is_ours:
+    found = system.read(name)
+    if network and found is None:
         unit.append(WriteFile(name=name, text=text))
-    elif is_ours and not network:
+    elif found == text and network is False:
         unit.append(RemoveFile(name=name))
     rules = _installed(system, "udev", "60-tsgt.rules")
     changes: list[Change] = [*unit, *rules]
-    if unit:
+    if unit or _restart_is_due(system, role):  # an interrupted setup may have left a unit that is not loaded
         changes.append(RunCommand(("systemctl", "daemon-reload"), live=True))
     if rules:
         changes.append(RunCommand(("udevadm", "control", "--reload"), live=True))
@@ -261,18 +272,33 @@ def clock_step(system: System, role: Role) -> Step:
     )
 
 
-def start_step(system: System, role: Role, *, changed: bool) -> Step:
-    """Start the service; start it again if something has ``changed``."""
+def before_restart(system: System, role: Role, step: Step) -> Step:
+    """Return a step after whose changes the service has to be started again, if not by this setup, by the next."""
+    if not (system.live and step.ok and step.changes) or _restart_is_due(system, role):
+        return step
+    return replace(step, changes=(WriteFile(name=role.restart_due, text=""), *step.changes))
+
+
+def _restart_is_due(system: System, role: Role) -> bool:
+    return system.live and system.path(role.restart_due).exists()
+
+
+def start_step(system: System, role: Role) -> Step:
+    """Start the service; start it again if this or an interrupted setup has changed something."""
     if not system.live:
         return Step(name="service", detail=f"{role.unit} starts when this system is booted")
     active = system.run(("systemctl", "is-active", role.unit)).code == 0
-    if active and not changed:
+    due = _restart_is_due(system, role)
+    if active and not due:
         return Step(name="service", detail=f"{role.unit} is running")
     failure = f"{role.unit} does not start: journalctl -u {role.unit} -b -n 20"
     return Step(
         name="service",
         detail=f"{role.unit} is running",
-        changes=(RunCommand(("systemctl", "restart", role.unit), failure=failure),),
+        changes=(
+            RunCommand(("systemctl", "restart", role.unit), failure=failure),
+            *([RemoveFile(name=role.restart_due)] if due else []),
+        ),
     )
 
 

@@ -67,6 +67,8 @@ class PiToSetUp:
         All commands that were run, but for questions.
     spi_at_boot
         Whether SPI takes a reboot.
+    interrupted_at
+        Command instead of which the operator presses Ctrl-C, once; empty: none.
     """
 
     def __init__(self, root: Path) -> None:
@@ -75,6 +77,7 @@ class PiToSetUp:
         self.instruments: dict[str, int | None] = {ADAPTER: 115_200}
         self.commands: list[str] = []
         self.spi_at_boot = False
+        self.interrupted_at = ""
         self.uid = 0
         self.operator: str | None = "pi"
         self.active: set[str] = set()
@@ -165,7 +168,11 @@ class PiToSetUp:
                 return Ran(0 if unit in self.active else 3, "")
             case ["timedatectl", "show", *_]:
                 return Ran(0, f"NTP={'yes' if self.ntp else 'no'}\n")
-        self.commands.append(" ".join(arguments))
+        command = " ".join(arguments)
+        if command == self.interrupted_at:
+            self.interrupted_at = ""
+            raise KeyboardInterrupt
+        self.commands.append(command)
         match list(arguments):
             case ["systemd-sysusers", "--inline", line]:
                 self._sysusers(line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from contextlib import aclosing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, TypeVar
 
@@ -16,7 +16,7 @@ from tsgt.cli import doctor
 from tsgt.cli.config import problems_at_start
 from tsgt.cli.doctor import LABELS
 from tsgt.cli.setup.options import answer
-from tsgt.config import Model, WiringConfig, find_problems
+from tsgt.config import Model, SuperframeConfig, WiringConfig, find_problems
 from tsgt.doctor import run_checks
 from tsgt.errors import RadioError
 from tsgt.log import configure_logging
@@ -30,6 +30,7 @@ from tsgt.setup import (
     Step,
     WiringSearch,
     WriteFile,
+    before_restart,
     clock_step,
     compare_configuration,
     configuration_step,
@@ -44,6 +45,7 @@ from tsgt.setup import (
     start_step,
     system_step,
     user_step,
+    uses_network,
 )
 
 if TYPE_CHECKING:
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
 
     from tsgt.cli.setup.options import Common
     from tsgt.cli.setup.session import Session
+    from tsgt.config import ClientConfig, MasterConfig
     from tsgt.doctor import Finding
     from tsgt.setup import MasterAnswers, Mission, RadioAnswers, StationAnswers
 
@@ -61,11 +64,15 @@ _SPI_WAIT_S = 3.0
 _SPI_POLL_S = 0.2
 
 
-def prepare(session: Session) -> None:
-    """Check the system, enable SPI, and make the user of the services."""
+def check_system(session: Session) -> None:
+    """Check the system, before anything is changed."""
     configure_logging("error")  # the steps say everything
+    session.do(system_step(session.system, session.role, dry_run=session.dry_run))
+
+
+def prepare(session: Session) -> None:
+    """Enable SPI, and make the user of the services."""
     system = session.system
-    session.do(system_step(system, session.role, dry_run=session.dry_run))
     enabled = session.do(spi_step(system))
     if system.live and not session.dry_run:
         until_s = time.monotonic() + _SPI_WAIT_S
@@ -150,15 +157,18 @@ def _channel(radio: RadioAnswers) -> tuple[str | None, float, float]:
 def _wiring(
     session: Session, common: Common, settings: LoRaSettings, before: WiringConfig | None
 ) -> WiringConfig:
-    """Return the wiring with which the radio responds; in an image the given one."""
+    """Return the wiring with which the radio responds; in an image the given one.
+
+    Of a given wiring, what no option names is that of ``before``.
+    """
     system, search = session.system, common.search
-    asked = search != WiringSearch()
+    wanted = None if before is None else search.applied_to(before)
     if not system.live:
-        wiring = before if before is not None and not asked else next(search.wirings(["spidev0.0"]))
+        wiring = wanted or next(search.wirings(["spidev0.0"]))
         session.report("radio", ok=True, detail=f"not asked in an image; {_shown(wiring)}")
         return wiring
     if before is not None and is_running(session):
-        if asked:
+        if wanted != before:
             session.fail("radio", f"in use by the running service: sudo systemctl stop {session.role.unit}")
         session.report("radio", ok=True, detail=f"in use by the running service; {_shown(before)}")
         return before
@@ -166,10 +176,9 @@ def _wiring(
         wiring = next(search.wirings(["spidev0.0"]))
         session.report("radio", ok=True, detail="would be asked when SPI is enabled")
         return wiring
-    candidates = [
-        *([before] if before is not None and not asked else []),
-        *search.wirings(spi_devices(system)),
-    ]
+    if before is not None and search != WiringSearch():
+        search = search.completed_from(before)
+    candidates = [*([] if wanted is None else [wanted]), *search.wirings(spi_devices(system))]
     machine = doctor.this_machine()
     try:
         found = service.run(
@@ -201,38 +210,51 @@ def configure(
     text: str | None,
     *,
     key: bytes | None,
+    key_is_used: bool = True,
     contradicted: Sequence[str] = (),
     expected: Collection[str] = (),
-    network: bool = False,
 ) -> None:
     """Install key, configuration and service, check the machine, and start the service.
 
-    ``text``: of the configuration; None keeps the one that is there. ``contradicted``: names of the answers that the one
-    that is there has otherwise. ``expected``: checks that fail until the machine is complete, because the instrument is
-    still missing. ``network``: whether the instrument is in the network, which the service may use then.
+    ``text``: of the configuration; None keeps the one that is there. ``key``: None keeps the one that is there.
+    ``key_is_used``: whether the configuration names the file of the key. ``contradicted``: names of the answers that the
+    one that is there has otherwise. ``expected``: checks that fail until the machine is complete, because the instrument is
+    still missing.
     """
     system, role = session.system, session.role
-    placing_key = key_step(system, key, replace=common.replace_key)
+    placing_key = (
+        key_step(system, key, replace=common.replace_key)
+        if key_is_used
+        else Step(name="key", detail=f"not used: {role.config} does not name {KEY}")
+    )
     if not placing_key.ok:
         session.do(placing_key)
     # Before the key is replaced: with the key of one mission and the channel of another it could talk to neither.
     placing, checked = _configuration(session, common, text, contradicted, new_key=key is not None)
-    changed = session.do(placing_key)
+    services = services_step(system, role, network=uses_network(checked))
+    session.do(before_restart(system, role, placing_key))
     if not session.dry_run:
         _check(session, checked)
-    changed |= session.do(placing)
-    changed |= session.do(services_step(system, role, network=network))
+    session.do(before_restart(system, role, placing))
+    session.do(before_restart(system, role, services))
     session.do(journal_step(system))
     session.do(clock_step(system, role))
     if session.dry_run:
         return
     _check_machine(session, expected)
-    session.do(start_step(system, role, changed=changed))
+    session.do(start_step(system, role))
 
 
-def keep_configuration(session: Session, common: Common, options: dict[str, object]) -> None:
+def keep_configuration(
+    session: Session, common: Common, config: ClientConfig | MasterConfig, options: dict[str, object]
+) -> None:
     """Set up the rest of a machine that has a configuration of a kind that setup does not write; ``options``: for it."""
-    options |= {"--antenna-gain-dbi": common.antenna_gain_dbi, "--licence": common.licence}
+    options |= {
+        "--antenna-gain-dbi": common.antenna_gain_dbi,
+        "--licence": common.licence,
+        **{f"--{name.replace('_', '-')}": value for name, value in asdict(common.search).items()},
+        "--replace-key": common.replace_key or None,
+    }
     given = [name for name, value in options.items() if value is not None]
     if given:
         session.fail(
@@ -240,7 +262,15 @@ def keep_configuration(session: Session, common: Common, options: dict[str, obje
             f"{session.role.config} stays, as its instrument, radio or protocol is of a kind that setup does not write: "
             f"{', '.join(given)} would not be in force; edit it, or --replace-config",
         )
-    configure(session, common, None, key=None)
+    protocol = config.protocol
+    key_file = protocol.key_file if isinstance(protocol, SuperframeConfig) else None
+    configure(
+        session,
+        common,
+        None,
+        key=None,
+        key_is_used=key_file is not None and key_file.absolute() == session.system.path(KEY).absolute(),
+    )
 
 
 def _configuration(

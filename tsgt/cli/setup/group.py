@@ -12,7 +12,7 @@ from tsgt.cli.options import FiniteRange, json_option, path_type
 from tsgt.cli.output import print_json
 from tsgt.cli.setup.master import run_master_setup
 from tsgt.cli.setup.mission import mission_of_master, show_mission
-from tsgt.cli.setup.options import Common
+from tsgt.cli.setup.options import Common, SpiDevice
 from tsgt.cli.setup.session import this_system
 from tsgt.cli.setup.station import PRISM_TYPES, run_station_setup
 from tsgt.radio.planning import REGIONS
@@ -75,7 +75,12 @@ def _common(command: Callable[..., Any]) -> Callable[..., Any]:
             type=click.Choice(["gpiod", "rpi-gpio"]),
             help="Access to the pins.  [default: found]",
         ),
-        click.option("--spi-device", metavar="spidevB.D", help="SPI device of the radio.  [default: found]"),
+        click.option(
+            "--spi-device",
+            type=SpiDevice(),
+            metavar="spidevB.D",
+            help="SPI device of the radio.  [default: found]",
+        ),
         click.option(
             "--nss-pin",
             type=click.IntRange(-1, 1000),
@@ -84,8 +89,7 @@ def _common(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--reset-pin",
             type=click.IntRange(0, 1000),
-            default=17,
-            help="Pin NRESET of the radio, BCM number.",
+            help="Pin NRESET of the radio, BCM number.  [default: that of before, or 17]",
         ),
         click.option(
             "--dio0-pin",
@@ -98,7 +102,11 @@ def _common(command: Callable[..., Any]) -> Callable[..., Any]:
             is_flag=True,
             help="Replace an edited configuration; the old one is kept beside it.",
         ),
-        click.option("--replace-key", is_flag=True, help="Replace the key of another mission."),
+        click.option(
+            "--replace-key",
+            is_flag=True,
+            help="Replace the key of another mission; on the master: make a new key, which all stations then need.",
+        ),
         _root_option,
         click.option(
             "--yes", is_flag=True, help="Do not ask; options that are not given take their defaults."

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import secrets
+from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import click
 
 from tsgt.cli.setup.common import (
+    check_system,
     configuration_before,
     configure,
     differing,
@@ -16,7 +18,7 @@ from tsgt.cli.setup.common import (
     radio_of,
 )
 from tsgt.cli.setup.mission import channel_text, mission_key, mission_of, mission_of_master, show_mission
-from tsgt.cli.setup.options import answer
+from tsgt.cli.setup.options import answer, require_answers
 from tsgt.cli.setup.session import SetupStopped
 from tsgt.config import MasterConfig
 from tsgt.errors import ConfigError
@@ -26,6 +28,7 @@ from tsgt.setup import MASTER, MasterAnswers, Mission, master_text
 
 if TYPE_CHECKING:
     from tsgt.cli.setup.options import Common
+    from tsgt.setup import System
 
 SPREADING_FACTOR = 9
 DEFAULT_STATIONS = 3
@@ -36,11 +39,16 @@ def run_master_setup(common: Common, *, region: str | None, stations: int | None
     session = common.session(MASTER)
     made = False
     try:
-        prepare(session)
+        check_system(session)
         config = configuration_before(session, MasterConfig)
         before = None if config is None else MasterAnswers.of(config)
-        if config is not None and before is None and not common.replace_config:
-            keep_configuration(session, common, {"--region": region, "--stations": stations})
+        staying = config if before is None and not common.replace_config else None
+        if staying is None:
+            known_region = region or (before and before.radio.region)
+            require_answers(session, {"--region": known_region, "--stations": stations or before})
+        prepare(session)
+        if staying is not None:
+            keep_configuration(session, common, staying, {"--region": region, "--stations": stations})
             return session.finish()
         chosen_region = answer(
             session,
@@ -58,10 +66,7 @@ def run_master_setup(common: Common, *, region: str | None, stations: int | None
             click.IntRange(1, 16),
             before.stations if before is not None else DEFAULT_STATIONS if session.ask else None,
         )
-        try:
-            key, made = mission_key(session.system), False
-        except ConfigError:
-            key, made = secrets.token_bytes(KEY_BYTES), True
+        key, source = _key(session.system, replace=common.replace_key)
         kept = config is not None and before is not None and before.radio.region == chosen_region
         shared = (
             mission_of(config.radio, key) if kept and config is not None else _new_mission(chosen_region, key)
@@ -69,8 +74,9 @@ def run_master_setup(common: Common, *, region: str | None, stations: int | None
         session.report(
             "mission",
             ok=True,
-            detail=f"{channel_text(shared)}; {'a new key' if made else 'the key of before'}",
+            detail=f"{channel_text(shared)}; {source}",
         )
+        made = source is not KeySource.BEFORE
         radio = radio_of(session, common, shared, None if before is None else before.radio)
         answers = MasterAnswers(stations=count, radio=radio)
         configure(
@@ -86,6 +92,25 @@ def run_master_setup(common: Common, *, region: str | None, stations: int | None
         else:
             session.say("The text for the stations: sudo tsgt setup mission")
     return code
+
+
+class KeySource(StrEnum):
+    """Where the key of a master's mission comes from."""
+
+    BEFORE = "the key of before"
+    FIRST = "a new key"
+    REPLACED = "a new key instead of the one of before: all stations need the new text, and --replace-key"
+
+
+def _key(system: System, *, replace: bool) -> tuple[bytes, KeySource]:
+    """Return the key of the machine; a new one if there is none, or if it is to be replaced."""
+    try:
+        before = mission_key(system)
+    except ConfigError:
+        return secrets.token_bytes(KEY_BYTES), KeySource.FIRST
+    if replace:
+        return secrets.token_bytes(KEY_BYTES), KeySource.REPLACED
+    return before, KeySource.BEFORE
 
 
 def _new_mission(region: str, key: bytes) -> Mission:

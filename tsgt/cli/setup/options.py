@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,19 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.setup import Role, WiringSearch
+
+
+class SpiDevice(click.ParamType[str]):
+    """Name of an SPI device, also with its folder: ``/dev/spidev0.0``."""
+
+    name = "spi device"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the name without the folder."""
+        found = re.fullmatch(r"(?:/dev/)?(spidev[0-9]{1,3}\.[0-9]{1,3})", str(value))
+        if found is None:
+            self.fail(f"{value!r} is no SPI device such as spidev0.1", param, ctx)
+        return found[1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +53,13 @@ class Common:
             dry_run=self.dry_run,
             quiet=self.as_json,
         )
+
+
+def require_answers(session: Session, known: dict[str, object]) -> None:
+    """Raise a usage error, before anything is changed, for options whose values are neither ``known`` nor can be asked for."""
+    missing = [option for option, value in known.items() if value is None]
+    if missing and not session.ask:
+        raise click.UsageError(f"{', '.join(missing)}: needed with --yes, with --json, or without a terminal")
 
 
 def answer(session: Session, given: Any, option: str, question: str, kind: Any, default: Any = None) -> Any:

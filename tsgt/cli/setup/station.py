@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from tsgt import service
 from tsgt.cli import doctor
 from tsgt.cli.setup.common import (
+    check_system,
     configuration_before,
     configure,
     differing,
@@ -20,7 +21,7 @@ from tsgt.cli.setup.common import (
     radio_of,
 )
 from tsgt.cli.setup.mission import channel_text, given_mission, mission_key, mission_of
-from tsgt.cli.setup.options import answer
+from tsgt.cli.setup.options import answer, require_answers
 from tsgt.cli.setup.session import SetupStopped
 from tsgt.config import ClientConfig, InstrumentPort, TcpAddress
 from tsgt.errors import ConfigError
@@ -60,13 +61,28 @@ def run_station_setup(
     """Set up a station; return the exit code."""
     session = common.session(CLIENT)
     try:
-        prepare(session)
+        check_system(session)
         config = configuration_before(session, ClientConfig)
         before = None if config is None else StationAnswers.of(config)
-        if config is not None and before is None and not common.replace_config:
+        known = None if config is None or before is None else _known_mission(session, config)
+        if instrument not in (None, "none"):
+            _port(instrument)
+        staying = config if before is None and not common.replace_config else None
+        if staying is None:
+            require_answers(
+                session,
+                {
+                    "--station": station or before,
+                    "--mission": mission or known,
+                    "--prism-type": prism_type or before,
+                },
+            )
+        prepare(session)
+        if staying is not None:
             keep_configuration(
                 session,
                 common,
+                staying,
                 {
                     "--station": station,
                     "--prism": prism,
@@ -76,7 +92,7 @@ def run_station_setup(
                 },
             )
             return session.finish()
-        shared = _mission(session, mission, config if before is not None else None)
+        shared = _mission(session, mission, known)
         number = answer(
             session,
             station,
@@ -124,7 +140,6 @@ def run_station_setup(
                 common, before, answers, found=("baud", "port") if instrument is None else ("baud",)
             ),
             expected=expected,
-            network=port.startswith("tcp://"),
         )
     except SetupStopped:
         pass
@@ -135,13 +150,15 @@ def _of(before: StationAnswers | None, name: str) -> int | str | None:
     return None if before is None else getattr(before, name)
 
 
-def _mission(session: Session, given: str | None, config: ClientConfig | None) -> Mission:
-    known = None
-    if config is not None:
-        try:
-            known = mission_of(config.radio, mission_key(session.system))
-        except ConfigError:
-            known = None
+def _known_mission(session: Session, config: ClientConfig) -> Mission | None:
+    """Return the mission of a configuration; None without its key."""
+    try:
+        return mission_of(config.radio, mission_key(session.system))
+    except ConfigError:
+        return None
+
+
+def _mission(session: Session, given: str | None, known: Mission | None) -> Mission:
     try:
         shared = given_mission(session, given, known)
     except MissionError as error:
@@ -156,7 +173,9 @@ def _instrument(session: Session, given: str | None, before: StationAnswers | No
     if given == "none" or (given is None and not system.live and before is None):
         session.report("instrument", ok=True, detail="none yet: connect it later, and call this again")
         return NO_INSTRUMENT, DEFAULT_BAUD
-    if before is not None and given in (None, before.port) and (not system.live or is_running(session)):
+    # A service that waits for an instrument has none open: it is looked for.
+    in_use = before is not None and before.port != NO_INSTRUMENT and is_running(session)
+    if before is not None and given in (None, before.port) and (in_use or not system.live):
         session.report("instrument", ok=True, detail=f"{before.port}, as before")
         return before.port, before.baud
     if given is not None and not system.live:
@@ -181,6 +200,8 @@ def _chosen(
     before: StationAnswers | None,
 ) -> tuple[str, int]:
     if not found:
+        if before is not None and given is None and before.port == NO_INSTRUMENT:
+            return _instrument(session, "none", before)
         if before is not None and given is None:
             session.report("instrument", ok=True, detail=f"{before.port} as before; it does not respond now")
             return before.port, before.baud

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from dataclasses import replace
 from functools import partialmethod
+from importlib.resources import files
 from typing import TYPE_CHECKING
 
 import click
@@ -58,6 +60,30 @@ OTHER_MISSION = encode_mission(
 )
 STATION = ("setup", "station", "--yes", "--station", 2, "--prism-type", "mini_360", "--mission", MISSION)
 MASTER = ("setup", "master", "--yes", "--region", "CA915", "--stations", 3)
+
+CLASSIC = """\
+kind = "client"
+station = 1
+prism = 1
+
+[instrument]
+kind = "leica"
+port = "/dev/ttyUSB0"
+prism_type = "mini_360"
+
+[radio]
+kind = "sx127x"
+frequency_mhz = 905.0
+spreading_factor = 9
+bandwidth_khz = 500.0
+region = "CA915"
+
+[protocol]
+kind = "classic"
+
+[journal]
+directory = "/var/lib/tsgt"
+"""
 
 
 @pytest.fixture
@@ -142,6 +168,49 @@ def test_chip_select_is_found(tsgt: Tsgt, pi: PiToSetUp, nss_pin: int) -> None:
     assert radio.wiring.nss_pin == nss_pin
 
 
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [(("--reset-pin", 17), (17, 4)), (("--dio0-pin", 22), (27, 22)), (("--nss-pin", 25), (27, 4))],
+)
+def test_pin_that_is_given_changes_and_the_others_stay(
+    tsgt: Tsgt, pi: PiToSetUp, given: tuple[object, ...], expected: tuple[int, int]
+) -> None:
+    """Also the default, where the configuration has another pin."""
+    tsgt(*STATION, "--reset-pin", 27)
+    pi.active.clear()
+    done = tsgt("setup", "station", "--yes", *given)
+    assert done.code == 0, done.out
+    radio = client(pi).radio
+    assert isinstance(radio, HardwareRadioConfig)
+    assert (radio.wiring.reset_pin, radio.wiring.dio0_pin) == expected
+
+
+@pytest.mark.usefixtures("pi")
+def test_wiring_option_may_be_repeated_while_the_service_runs(tsgt: Tsgt) -> None:
+    """It is in force; another one needs the radio."""
+    assert tsgt(*STATION, "--reset-pin", 27).code == 0
+    assert "Nothing was changed" in tsgt("setup", "station", "--yes", "--reset-pin", 27).out
+    line = failed(tsgt("setup", "station", "--yes", "--reset-pin", 17))
+    assert "sudo systemctl stop tsgt-client.service" in line
+
+
+def test_spi_device_may_be_a_path(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """As `ls /dev/spidev*` prints it."""
+    done = tsgt(*STATION, "--spi-device", "/dev/spidev0.0")
+    assert done.code == 0, done.out
+    assert isinstance(client(pi).radio, HardwareRadioConfig)
+
+
+@pytest.mark.parametrize("given", ["spidev0", "/dev/ttyUSB0", "spidev0.x", "spidev1001.0", "spidev0.0 "])
+def test_spi_device_of_another_name_is_a_usage_error(tsgt: Tsgt, pi: PiToSetUp, given: str) -> None:
+    """Before anything is changed."""
+    before = pi.files()
+    done = tsgt(*STATION, "--spi-device", given)
+    assert done.code == 2
+    assert "spidev0.1" in done.err
+    assert pi.files() == before
+
+
 def test_baud_rate_of_the_instrument_is_found(tsgt: Tsgt, pi: PiToSetUp) -> None:
     """Its name and serial number are printed."""
     pi.instruments[ADAPTER] = 19_200
@@ -155,13 +224,15 @@ def test_baud_rate_of_the_instrument_is_found(tsgt: Tsgt, pi: PiToSetUp) -> None
 
 
 def test_station_without_instrument_waits_for_it(tsgt: Tsgt, pi: PiToSetUp) -> None:
-    """It is found when the command is called again."""
+    """It is found when the command is called again, while the service that waits for it runs."""
     pi.instruments[ADAPTER] = None
     line = failed(tsgt(*STATION))
     assert "--instrument none" in line
     assert tsgt(*STATION, "--instrument", "none").code == 0
+    again = tsgt("setup", "station", "--yes")
+    assert again.code == 0
+    assert "none yet" in again.out
     pi.instruments[ADAPTER] = 115_200
-    pi.active.clear()
     assert tsgt("setup", "station", "--yes").code == 0
     instrument = client(pi).instrument
     assert isinstance(instrument, LeicaInstrumentConfig)
@@ -199,6 +270,52 @@ def test_instrument_on_a_cable_again_closes_the_network(tsgt: Tsgt, pi: PiToSetU
     assert not drop_in.exists()
     drop_in.write_text(f"{content}# of somebody\n")
     assert tsgt(*STATION, *by_cable).code == 0
+    assert drop_in.exists()
+
+
+def network_drop_in(pi: PiToSetUp) -> Path:
+    """Allow the service by hand to use the network, as docs/how-to/connect-an-instrument.md says; return the file."""
+    content = (files("tsgt.setup") / "files/systemd/network-instrument.conf").read_text()
+    return pi.write("etc/systemd/system/tsgt-client.service.d/network-instrument.conf", content)
+
+
+def use_classic(path: Path, *, port: str | None = None) -> None:
+    """Change the protocol of a configuration to the paper's, which setup does not write, and the port."""
+    text = re.sub(r'kind = "superframe"\nkey_file = .*\n', 'kind = "classic"\n', path.read_text())
+    path.write_text(text if port is None else re.sub(r"(?m)^port = .*$", f'port = "{port}"', text))
+
+
+def test_network_stays_open_for_the_configuration_that_stays(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """One of a kind that setup does not write, whose instrument is in the network."""
+    pi.instruments["tcp://10.0.0.5:1212"] = 115_200
+    assert tsgt(*STATION).code == 0
+    use_classic(pi.root / "etc/tsgt/client.toml", port="tcp://10.0.0.5:1212")
+    drop_in = network_drop_in(pi)
+    assert tsgt("setup", "station", "--yes").code == 0
+    assert drop_in.exists()
+    narrowed = edit(drop_in, "IPAddressAllow=any", "IPAddressAllow=10.0.0.5")
+    assert tsgt("setup", "station", "--yes").code == 0
+    assert drop_in.read_text() == narrowed
+
+
+def test_network_stays_open_when_an_instrument_is_found_on_a_cable(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """But the edited configuration stays, whose instrument is in the network."""
+    pi.instruments["tcp://10.0.0.5:1212"] = 115_200
+    assert tsgt(*STATION, "--instrument", "tcp://10.0.0.5:1212").code == 0
+    edit(pi.root / "etc/tsgt/client.toml", "search_window_deg = 40.0", "search_window_deg = 60.0")
+    pi.active.clear()
+    done = tsgt("setup", "station", "--yes")
+    assert done.code == 0, done.out
+    assert "+port" in done.out
+    assert (pi.root / "etc/systemd/system/tsgt-client.service.d/network-instrument.conf").exists()
+
+
+def test_network_of_a_bridge_is_left_as_it_is(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Whether its program needs the network is the operator's knowledge."""
+    assert tsgt(*STATION).code == 0
+    use_bridge(pi.root / "etc/tsgt/client.toml")
+    drop_in = network_drop_in(pi)
+    tsgt("setup", "station", "--yes")
     assert drop_in.exists()
 
 
@@ -298,12 +415,51 @@ def test_other_answers_replace_a_configuration_of_setup(tsgt: Tsgt, pi: PiToSetU
     assert pi.commands == ["systemctl restart tsgt-client.service"]
 
 
-@pytest.mark.usefixtures("pi")
-def test_missing_answers_are_named(tsgt: Tsgt) -> None:
+def test_interrupted_setup_restarts_the_service_in_the_next_run(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """It runs with the key and configuration of before until then."""
+    tsgt(*STATION)
+    pi.ntp, pi.interrupted_at = True, "timedatectl set-ntp false"
+    assert tsgt("setup", "station", "--yes", "--replace-key", "--mission", OTHER_MISSION).code == 130
+    assert client(pi).radio.region == "EU868"
+    pi.commands = []
+    done = tsgt("setup", "station", "--yes")
+    assert done.code == 0, done.out
+    assert pi.commands[-1] == "systemctl restart tsgt-client.service"
+    pi.commands = []
+    assert "Nothing was changed" in tsgt("setup", "station", "--yes").out
+    assert pi.commands == []
+
+
+def test_interrupted_setup_loads_the_unit_in_the_next_run(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """Systemd would start the service by the unit of before."""
+    tsgt(*STATION)
+    edit(pi.root / "etc/systemd/system/tsgt-client.service", "[Service]", "[Service]\nNice=1")
+    pi.interrupted_at = "systemctl daemon-reload"
+    assert tsgt("setup", "station", "--yes").code == 130
+    pi.commands = []
+    assert tsgt("setup", "station", "--yes").code == 0
+    assert pi.commands == ["systemctl daemon-reload", "systemctl restart tsgt-client.service"]
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("station", "--yes", "--mission", MISSION), "--station, --prism-type"),
+        (("station", "--json", "--station", 1, "--prism-type", "360"), "--mission"),
+        (("master", "--json"), "--region, --stations"),
+        (("master", "--yes", "--stations", 3), "--region"),
+        ((*STATION[1:], "--instrument", "tcp://10.0.0.5"), "--instrument tcp://10.0.0.5"),
+    ],
+)
+def test_missing_and_impossible_answers_are_named_before_anything_is_changed(
+    tsgt: Tsgt, pi: PiToSetUp, options: tuple[object, ...], named: str
+) -> None:
     """A usage error, without a terminal to ask at."""
-    done = tsgt("setup", "station", "--yes", "--mission", MISSION)
+    before = pi.files()
+    done = tsgt("setup", *options)
     assert done.code == 2
-    assert "--station" in done.err
+    assert f"Error: {named}" in done.err
+    assert (pi.files(), pi.commands) == (before, [])
 
 
 def test_master_makes_the_key_and_shows_the_text_for_its_stations(tsgt: Tsgt, pi: PiToSetUp) -> None:
@@ -331,6 +487,20 @@ def test_second_run_of_the_master_keeps_the_key(tsgt: Tsgt, pi: PiToSetUp) -> No
     assert pi.files() == before
 
 
+def test_master_makes_a_new_key_on_request(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """On the same channel; the stations need the new text, which is shown."""
+    tsgt(*MASTER)
+    key, config = pi.root / "etc/tsgt/radio.key", pi.root / "etc/tsgt/master.toml"
+    before, channel, pi.commands = key.read_text(), config.read_text(), []
+    done = tsgt("setup", "master", "--yes", "--replace-key")
+    assert done.code == 0, done.out
+    assert key.read_text() != before
+    assert config.read_text() == channel
+    assert "all stations need the new text" in done.out
+    assert tsgt("setup", "mission").out.strip() in done.out
+    assert pi.commands == ["systemctl restart tsgt-master.service"]
+
+
 def test_antenna_that_no_power_is_legal_with_is_refused(tsgt: Tsgt, pi: PiToSetUp) -> None:
     """With settings that comply, before anything is written."""
     done = tsgt("setup", "master", "--yes", "--region", "EU433", "--stations", 3, "--antenna-gain-dbi", 9)
@@ -346,6 +516,13 @@ def test_licence_lifts_the_limits_of_the_region(tsgt: Tsgt, pi: PiToSetUp) -> No
     assert tsgt("setup", "master", "--yes", "--stations", 2).code == 0
     config = load(pi.root / "etc/tsgt/master.toml", MasterConfig)
     assert (config.radio.licence, len(config.stations)) == ("CEPT 4711", 2)
+
+
+def use_bridge(path: Path) -> None:
+    """Change the instrument of a configuration to a program, which setup does not write."""
+    before, after = path.read_text().split("[instrument]")
+    bridge = '[instrument]\nkind = "bridge"\ncommand = ["true"]\n\n'
+    path.write_text(before + bridge + after[after.index("[radio]") :])
 
 
 def edit(path: Path, before: str, after: str) -> str:
@@ -420,17 +597,56 @@ def test_option_that_an_edited_configuration_contradicts_fails(
 def test_option_for_a_configuration_that_setup_does_not_write_fails(tsgt: Tsgt, pi: PiToSetUp) -> None:
     """One with another kind of instrument, for example; without options the rest of the machine is set up."""
     tsgt(*STATION)
-    path = pi.root / "etc/tsgt/client.toml"
-    before, after = path.read_text().split("[instrument]")
-    bridge = '[instrument]\nkind = "bridge"\ncommand = ["true"]\n\n'
-    path.write_text(before + bridge + after[after.index("[radio]") :])
-    files = pi.files()
+    use_bridge(pi.root / "etc/tsgt/client.toml")
+    before = pi.files()
     line = failed(tsgt("setup", "station", "--yes", "--replace-key", "--mission", OTHER_MISSION))
-    assert "--mission would not be in force" in line
-    assert pi.files() == files
+    assert "--mission, --replace-key would not be in force" in line
+    assert pi.files() == before
     done = tsgt("setup", "station", "--yes")
     assert "FAILED  configuration" not in done.out
-    assert pi.files() == files
+    assert pi.files() == before
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--dio0-pin", 22),
+        ("--nss-pin", 8),
+        ("--reset-pin", 17),
+        ("--spi-device", "spidev0.0"),
+        ("--replace-key",),
+    ],
+)
+def test_wiring_and_key_for_a_configuration_that_setup_does_not_write_fail(
+    tsgt: Tsgt, pi: PiToSetUp, option: tuple[object, ...]
+) -> None:
+    """They would not be in force."""
+    pi.write("etc/tsgt/client.toml", CLASSIC)
+    assert f"{option[0]} would not be in force" in failed(tsgt("setup", "station", "--yes", *option))
+    assert (pi.root / "etc/tsgt/client.toml").read_text() == CLASSIC
+
+
+@pytest.mark.parametrize("role", [STATION, MASTER], ids=["station", "master"])
+def test_configuration_without_a_key_needs_none(tsgt: Tsgt, pi: PiToSetUp, role: tuple[object, ...]) -> None:
+    """The protocol of the paper has none."""
+    tsgt(*role)
+    (path,) = (pi.root / "etc/tsgt").glob("*.toml")
+    use_classic(path)
+    (pi.root / "etc/tsgt/radio.key").unlink()
+    done = tsgt(*role[:2], "--yes")
+    assert "ok      key            not used" in done.out
+    assert done.out.splitlines()[-1].startswith("Nothing was changed")
+
+
+def test_missing_key_of_a_configuration_that_stays_is_to_be_installed(tsgt: Tsgt, pi: PiToSetUp) -> None:
+    """A mission's text would not be in force there, and a master takes none."""
+    tsgt(*STATION)
+    use_bridge(pi.root / "etc/tsgt/client.toml")
+    (pi.root / "etc/tsgt/radio.key").unlink()
+    line = failed(tsgt("setup", "station", "--yes"))
+    assert line.startswith("FAILED  key")
+    assert "tsgt radio key" in line
+    assert "--mission" not in line
 
 
 def test_refused_configuration_leaves_the_key(tsgt: Tsgt, pi: PiToSetUp) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tsgt.master.newest_measurement import NO_MEASUREMENT, NewestMeasurement
-from tsgt.model import Status
+from tsgt.model import NO_MEASUREMENT, NewestMeasurement, Status
 from tsgt.recording import LOW_BATTERY_PERCENT, EventRecord
 
 if TYPE_CHECKING:

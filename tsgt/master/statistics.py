@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from tsgt.estimation import usable
 from tsgt.master.link_events import NO_LINK
-from tsgt.master.newest_measurement import NO_MEASUREMENT, NewestMeasurement
-from tsgt.model import PolarMeasurement, Status
+from tsgt.model import NO_MEASUREMENT, NewestMeasurement, PolarMeasurement, Status
 from tsgt.radio.superframe import UNKNOWN_CONDITION
 from tsgt.recording import StationStatus, StatusRecord
 

@@ -13,6 +13,7 @@ from tsgt.model.measurements import (
     PolarMeasurement,
     Status,
 )
+from tsgt.model.newest_measurement import NO_MEASUREMENT, NewestMeasurement
 from tsgt.model.parameters import Parameters, SetupCovariance
 from tsgt.model.pipeline import MotionPrior, PipelineParameters
 from tsgt.model.robot import (
@@ -54,6 +55,7 @@ __all__ = [
     "MAX_INSTANT_NS",
     "MAX_NUMBER",
     "MIN_PRISMS",
+    "NO_MEASUREMENT",
     "ROBOT_FRAME",
     "ROBOT_ORIGIN",
     "TARGET_NOISE",
@@ -68,6 +70,7 @@ __all__ = [
     "Matrix4",
     "Measurement",
     "MotionPrior",
+    "NewestMeasurement",
     "OdometryParameters",
     "OdometrySamples",
     "Parameters",

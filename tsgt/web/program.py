@@ -11,7 +11,7 @@ from tsgt.web.mission import MissionState
 from tsgt.web.recorded import index_of
 from tsgt.web.replay import ReplayMessages
 from tsgt.web.server import Page, serve
-from tsgt.web.source import follow
+from tsgt.web.source import ArrivalClock, follow
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,11 +34,12 @@ async def run_live(
     ``foxglove``: makes what serves it to Foxglove apps as well.
     """
     state = MissionState(path.name)
-    apps = foxglove(state, clock) if foxglove is not None else None
-    messages = LiveMessages(state, clock, apps.view if apps is not None else None)
+    arrival_clock = ArrivalClock()
+    apps = foxglove(state, arrival_clock) if foxglove is not None else None
+    messages = LiveMessages(state, arrival_clock, apps.view if apps is not None else None)
     page = Page(settings, messages, clock, apps)
     async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(follow(path, apps or state, clock))
+        tasks.create_task(follow(path, apps or state, arrival_clock))
         tasks.create_task(messages.run())
         tasks.create_task(notify_systemd(lambda: f"{page.readers} readers", clock))
         tasks.create_task(serve(page, opened))

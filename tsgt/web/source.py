@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from typing import TYPE_CHECKING, NoReturn, Protocol
 
 import structlog
 
+from tsgt.client import monotonic_ns
+from tsgt.clock import SystemClock
 from tsgt.recording import MAX_LINE_BYTES
 from tsgt.service import LogLimiter
 
@@ -19,6 +22,17 @@ if TYPE_CHECKING:
 RETRY_S = 0.5
 
 log = structlog.get_logger()
+
+
+class ArrivalClock(SystemClock):
+    """The machine's clocks for the arrival of lines: the monotonic one also counts while the computer is suspended.
+
+    Lines that waited meanwhile are late then, and not of now. Only Linux has that clock.
+    """
+
+    def monotonic_ns(self) -> int:
+        """Return CLOCK_BOOTTIME in nanoseconds, CLOCK_MONOTONIC where there is none."""
+        return monotonic_ns() if hasattr(time, "CLOCK_BOOTTIME") else super().monotonic_ns()
 
 
 class Follower(Protocol):

@@ -1,9 +1,9 @@
 // Runs page.js without a browser: a document of which nothing is looked at, and clocks, connections and messages that the
-// scenario (argument 2, the body of a function) sets. The scenario's result is printed as JSON.
+// scenario (argument 2, the body of a function) sets. Argument 3: whether it is a replay, yes or no. The scenario's result is printed as JSON.
 
 const { readFileSync } = require("node:fs");
 
-const [file, scenario] = process.argv.slice(2);
+const [file, scenario, replay] = process.argv.slice(2);
 const page = readFileSync(file, "utf8").replace(/^import .*$/gm, "");
 
 // Everything that an element has is another element, and every call returns one.
@@ -12,6 +12,8 @@ function element() {
   const own = {
     dataset: {}, children: [], textContent: "", clientWidth: 100, [Symbol.toPrimitive]: () => "",
     querySelector: (selector) => selected[selector] ??= element(),
+    append: (...added) => { own.children.push(...added); },
+    replaceChildren: () => { own.children.length = 0; },
   };
   return new Proxy(function () {}, {
     get: (_, name) => name in own ? own[name] : name === "querySelectorAll" ? () => [element(), element()] : element(),
@@ -24,7 +26,7 @@ const elements = {};
 const document = element();
 document.getElementById = (id) => elements[id] ??= element();
 document.body = element();
-document.body.dataset = { replay: "no", encrypted: "no" };
+document.body.dataset = { replay, encrypted: "no" };
 document.documentElement = element();
 
 // Both clocks of the device; a device's sleep may stop the first.
@@ -35,7 +37,7 @@ const Clock = class extends Date { static now() { return time.wall_ms; } };
 const connections = [];
 const EventSource = class {
   static CLOSED = 2;
-  constructor() { this.readyState = 1; this.fresh = true; connections.push(this); }
+  constructor(url) { this.url = url; this.readyState = 1; this.fresh = true; connections.push(this); }
   close() {}
 };
 
@@ -59,6 +61,7 @@ const content = {}; // of the messages to come, beside the view
 const scenes = {
   connections, robot, view, content, map, events,
   textOf: (id, selector) => elements[id].querySelector(selector).textContent,
+  facts: () => elements.facts.children.map(({ textContent }) => textContent),
   words: () => verdict().words,
   // Let time pass, without the page's timers; the steady clock stands still in sleep.
   pass: (ms, steady_ms = ms) => { time.wall_ms += ms; time.steady_ms += steady_ms; },

@@ -175,6 +175,29 @@ def test_pose_of_a_late_stream_is_no_pose() -> None:
     assert sent(12.0, 12.0) == ["/tsgt/pose", "/tf", "/tsgt/scene"]
 
 
+def test_pose_that_leads_a_backlog_is_no_pose() -> None:
+    """After a silence the delay is unknown until a status tells it: poses are live again behind one that is in time."""
+    state = MissionState("poses.sock")
+    feed = Feed(state, lambda _: True)
+    state.connected(0.0)
+    state.line(encode_line(SETUP), 0.0)
+
+    def sent(record: Any, now_s: float) -> bool:
+        """Return whether a line gives a pose."""
+        line = encode_line(record)
+        state.line(line, now_s)
+        return "/tsgt/pose" in [each.topic for each in feed.line(line, now_s)]
+
+    sent(status(0.0), 0.0)
+    assert sent(pose(0.05), 0.05)
+    assert not sent(pose(0.1), 8.0)
+    assert not said(feed, state, 8.0)["pose_valid"]
+    sent(status(1.0), 8.0)
+    assert not sent(pose(1.05), 8.0)
+    sent(status(8.0), 8.0)
+    assert sent(pose(8.05), 8.05)
+
+
 def test_last_known_position_is_not_shown_in_a_new_frame() -> None:
     """It was one of the old frame, as was the trail."""
     state = MissionState("poses.sock")

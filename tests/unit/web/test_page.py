@@ -17,11 +17,11 @@ PAGE_IN_NODE = Path(__file__).with_name("page_in_node.js")
 pytestmark = pytest.mark.skipif(NODE is None, reason="node, which runs the page's code, is not installed")
 
 
-def run(scenario: str) -> Any:
-    """Return the result of a scenario; ``page_in_node.js`` has its words."""
+def run(scenario: str, replay: str = "no") -> Any:
+    """Return the result of a scenario; ``page_in_node.js`` has its words. ``replay``: yes or no."""
     page = resources.files("tsgt.web") / "page" / "page.js"
     found = subprocess.run(
-        [str(NODE), PAGE_IN_NODE, str(page), scenario], check=True, capture_output=True, timeout=60
+        [str(NODE), PAGE_IN_NODE, str(page), scenario, replay], check=True, capture_output=True, timeout=60
     )
     return json.loads(found.stdout)
 
@@ -99,6 +99,34 @@ def test_page_follows_a_robot_that_was_restarted() -> None:
         return run(10000);
     """)
     assert set(shown) == {"GOOD"}
+
+
+def test_replay_goes_on_where_its_connection_was_lost() -> None:
+    """The browser by itself would ask for the address of the first connection again, and so for the start."""
+    assert run(
+        """
+        content.replay = { at_s: 600, speed: 1 };
+        run(1000);
+        connections[0].readyState = 0;
+        connections[0].onerror();
+        pass(1200);
+        timers();
+        return connections.map(({ url }) => url);
+        """,
+        replay="yes",
+    ) == ["/stream", "/stream?at=600.0&speed=1"]
+
+
+def test_position_and_speed_are_those_of_a_valid_pose() -> None:
+    """An earlier or invalid one may have numbers as well; they are no facts of now."""
+    assert run("""
+        view.pose = { at: [1, 2, 0.5], heading_rad: 0, prisms: {}, speed_mps: 0.9, valid: true, age_s: 0.1 };
+        message();
+        const valid = facts();
+        view.pose.valid = false;
+        message();
+        return [valid, facts()];
+    """) == [["robot", "x 1.00, y 2.00, z 0.50 m; 0.9 m/s"], []]
 
 
 def test_item_that_comes_twice_is_listed_once() -> None:

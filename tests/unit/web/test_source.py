@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
@@ -84,6 +85,13 @@ async def test_line_of_a_newer_master_is_skipped(tmp_path: Path) -> None:
         async with master(path, *LINES, newer, b"{"), following(path) as state:
             await shown(state, "CARE", "status lines cannot be read: restart or update tsgt web")
     assert [each["event"] for each in logged].count("stream_line_rejected") == 1
+
+
+def test_clock_of_the_mission_counts_suspension(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else lines that waited meanwhile would be no older than those of now."""
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 2_000_000_000)
+    monkeypatch.setattr(time, "clock_gettime_ns", {time.CLOCK_BOOTTIME: 9_000_000_000}.__getitem__)
+    assert source.ArrivalClock().monotonic_ns() == 9_000_000_000
 
 
 @in_real_time

@@ -13,6 +13,7 @@ from harness.readers.web import feed, mission, pose, station, status
 from tsgt.model import ReferencePoint, Status
 from tsgt.recording import DiskStatus, EventRecord, RecordingStatus, SetupRecord, StationShare, encode_line
 from tsgt.web.messages import encode, message
+from tsgt.web.mission.history import Share
 from tsgt.web.mission.state import MissionState
 
 LEFT = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
@@ -259,6 +260,32 @@ def test_sight_line_ends_where_the_station_measured() -> None:
     assert (tile["sight"], tile["range_m"]) == ([pytest.approx(0.0, abs=1e-9), -20.0], 20.0)
 
 
+def test_measurement_of_the_backlog_is_no_sight_of_now() -> None:
+    """It comes after newer ones, with an earlier stamp and number; that its station is received is all that it says of now."""
+    state = mission()
+    lost = station(1, status=Status.NO_TARGET, last_heard_s=2.5, answering=False)
+    feed(state, status(300.0, lost), pose(300.0), now_s=300.0)
+    feed(state, replace(measurement(750), status=Status.NO_TARGET, slope_distance_m=None), now_s=300.1)
+    feed(state, measurement(50), now_s=301.0)
+    tile = state.view(301.1)["stations"][0]
+    assert (tile["state"], tile["words"]) == ("searching", "no prism")
+    assert (tile["range_m"], tile["sight"], state.sight_points(301.1)) == (None, None, {})
+    for sequence, now_s in enumerate((302.0, 303.0, 303.9), 51):
+        feed(state, measurement(sequence), now_s=now_s)
+    assert state.view(304.0)["stations"][0]["state"] == "searching"  # not silent
+
+
+def test_sight_of_a_clock_that_was_set_back_is_shown() -> None:
+    """Its stamp is earlier, but its number continues; after a new connection any number does."""
+    state = running()
+    feed(state, measurement(20), now_s=10.1)
+    feed(state, replace(measurement(0), sequence=21, slope_distance_m=40.0), now_s=10.5)
+    assert state.view(10.6)["stations"][0]["range_m"] == 40.0
+    state.connected(11.0)
+    feed(state, SETUP, status(11.0), replace(measurement(0), slope_distance_m=50.0), now_s=11.0)
+    assert state.view(11.1)["stations"][0]["range_m"] == 50.0
+
+
 def test_script_in_texts_stays_text_and_short() -> None:
     """Of an event: it is passed on as one line of bounded length, in JSON."""
     state = running()
@@ -392,6 +419,15 @@ def test_share_of_valid_poses_is_rounded_down() -> None:
         feed(state, pose(i / 50, **({"valid": False, "reason": "tilt"} if i == 1500 else {})), now_s=i / 50)
     feed(state, status(60.0), now_s=60.0)
     assert state.view(60.0)["figures"]["valid_share"] == 0.999
+
+
+def test_share_keeps_a_minute_although_nobody_asks() -> None:
+    """A program may only look at the findings, for days."""
+    share = Share()
+    for second in range(300):
+        share.count(float(second), valid=second >= 240)
+    assert len(share._seconds) == 61
+    assert share.value(299.0) == pytest.approx(60 / 61)
 
 
 def test_absurd_numbers_do_not_end_the_page() -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from tsgt.web.mission.verdict import GOOD, Finding, Hold, Level, PoseFacts, StreamFacts, judge
@@ -23,6 +25,7 @@ STATION = Finding(Level.CARE, "station 2: no prism")
         (StreamFacts(connected=False, problem="p"), VALID, [FENCE], "STREAM STOPPED", "p"),
         (StreamFacts(connected=True, silence_s=1.6), VALID, [], "STREAM STOPPED", "the master has sent nothing for 2 s"),
         (StreamFacts(connected=True, delay_s=4.0), VALID, [], "STREAM STOPPED", "the stream arrives 4 s late"),
+        (StreamFacts(connected=True, delay_s=math.inf), VALID, [], "STREAM STOPPED", "the stream arrives late"),
     ],
 )  # fmt: skip
 def test_verdict_is_the_worst_with_its_cause(

@@ -113,12 +113,16 @@ class Share:
         second = math.floor(now_s)
         if not self._seconds or self._seconds[-1][0] != second:
             self._seconds.append([second, 0, 0])
+            self._drop_old(now_s)
         self._seconds[-1][1] += 1
         self._seconds[-1][2] += valid
 
     def value(self, now_s: float) -> float | None:
         """Return the share, 0 to 1; None without poses."""
-        while self._seconds and self._seconds[0][0] < now_s - self.SPAN_S:
-            self._seconds.popleft()
+        self._drop_old(now_s)
         poses = sum(each[1] for each in self._seconds)
         return sum(each[2] for each in self._seconds) / poses if poses else None
+
+    def _drop_old(self, now_s: float) -> None:
+        while self._seconds and self._seconds[0][0] < now_s - self.SPAN_S:
+            self._seconds.popleft()

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tsgt.client.delay import LeastDelay
-from tsgt.model import PolarMeasurement
+from tsgt.model import NO_MEASUREMENT, NewestMeasurement, PolarMeasurement
 from tsgt.recording import (
     PROTOCOL_VERSION,
     EventRecord,
@@ -28,6 +29,7 @@ from tsgt.web.mission.history import EVENTS, History, Residuals, Share, Trail
 from tsgt.web.mission.stations import rounded
 from tsgt.web.mission.verdict import (
     POSE_AGE_LIMIT_S,
+    SILENCE_LIMIT_S,
     Finding,
     Hold,
     Level,
@@ -107,6 +109,7 @@ class MissionState:
         self._setup: SetupRecord | None = None
         self._status: StatusRecord | None = None
         self._status_s = 0.0
+        self._newest: dict[int, NewestMeasurement] = {}  # of each station
         self._forget_poses()
         self._share = Share()
         self._unreadable_s: dict[str, float] = {}  # when the last line of a type came that could not be read
@@ -145,6 +148,8 @@ class MissionState:
         """
         found = _TYPE.match(data)
         name = found[1].decode() if found else decode(Typed, data).type
+        if now_s - self._line_s > SILENCE_LIMIT_S:  # lines may have waited meanwhile: the next status tells
+            self._delay_s = math.inf
         self._line_s = now_s
         take = self._takers().get(name)
         if take is None:
@@ -228,8 +233,13 @@ class MissionState:
 
     def _take_measurement(self, data: bytes, now_s: float) -> None:
         measurement = decode(PolarMeasurement, data)
-        setup = self._setup_of(measurement.station)
-        self._sights[measurement.station] = stations.sight(measurement, setup, now_s)
+        number = measurement.station
+        if self._newest.get(number, NO_MEASUREMENT).is_newer_than(measurement):  # it is of the backlog
+            if number in self._sights:
+                self._sights[number] = replace(self._sights[number], heard_s=now_s)
+            return
+        self._newest[number] = NewestMeasurement.of(measurement)
+        self._sights[number] = stations.sight(measurement, self._setup_of(number), now_s)
 
     def _take_status(self, data: bytes, now_s: float) -> None:
         self._status, self._status_s = decode(StatusRecord, data), now_s

@@ -30,9 +30,10 @@ LABELS = {
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The last measurement of a station."""
+    """The newest measurement of a station."""
 
     measured_s: float  # when it arrived
+    heard_s: float  # when the last measurement arrived, of the backlog as well
     status: Status
     range_m: float | None
     point_m: Vector3 | None
@@ -47,7 +48,7 @@ def sight(measurement: PolarMeasurement, station: SetupStation | None, now_s: fl
         x, y, z = direction(measurement.horizontal_angle_rad, measurement.zenith_angle_rad)
         in_station = (distance_m * x, distance_m * y, distance_m * z)
         point = add(station.position_m, rotate(station.orientation_xyzw, in_station))
-    return Sight(now_s, measurement.status, distance_m, point)
+    return Sight(now_s, now_s, measurement.status, distance_m, point)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ def condition(station: StationStatus, elapsed_s: float, newest: Sight | None, no
         age_s = None if station.age_s is None else station.age_s + elapsed_s
         if newest is not None:  # a measurement that came after the status
             measured_s = now_s - newest.measured_s
-            heard_s = min(heard_s, measured_s)
+            heard_s = min(heard_s, now_s - newest.heard_s)
             if age_s is None or measured_s < age_s:
                 status, age_s = newest.status, measured_s
         station = replace(station, last_heard_s=heard_s, age_s=age_s, status=status)

@@ -5,6 +5,7 @@ A fourth word, NO CONNECTION, is the browser's own: it comes when this program f
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from enum import IntEnum
@@ -61,7 +62,7 @@ class StreamFacts:
     silence_s: float = 0.0
     """Time without any line."""
     delay_s: float = 0.0
-    """Delay of the newest line beyond the least one."""
+    """Delay of the newest line beyond the least one; infinite while it is unknown: after a silence, until a status comes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,7 +88,8 @@ def stream_findings(stream: StreamFacts) -> list[Finding]:
     if stream.silence_s > SILENCE_LIMIT_S:
         return [Finding(Level.STREAM_STOPPED, f"the master has sent nothing for {stream.silence_s:.0f} s")]
     if stream.delay_s > DELAY_LIMIT_S:
-        return [Finding(Level.STREAM_STOPPED, f"the stream arrives {stream.delay_s:.0f} s late")]
+        late = f"{stream.delay_s:.0f} s late" if math.isfinite(stream.delay_s) else "late"
+        return [Finding(Level.STREAM_STOPPED, f"the stream arrives {late}")]
     return []
 
 

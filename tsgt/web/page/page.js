@@ -51,8 +51,10 @@ function connect(query = "") {
   own.onmessage = (event) => { if (own === source) take(JSON.parse(event.data)); };
   own.onerror = () => {
     if (own !== source) return;
-    if (own.readyState !== EventSource.CLOSED) { opening(); return; } // by the browser itself
-    source = null; // refused: the code has changed, or too many readers
+    // By the browser itself, which asks for the same address again: in a replay that is where this connection began.
+    if (own.readyState !== EventSource.CLOSED && !replaying) { opening(); return; }
+    own.close();
+    source = null; // replaying, or refused: the code has changed, or too many readers
     fetch("/", { method: "HEAD" }).then((response) => { if (response.status === 401) location.assign("/"); }, () => {});
   };
 }
@@ -301,7 +303,7 @@ function showFacts(live) {
     const shown = [device, use ? use.replace("_", " ") : "", rate_hz ? `${rate_hz.toFixed(0)} Hz` : "", slip !== null ? `slip ${(100 * slip).toFixed(1)} %` : "", rejected ? `${(100 * rejected).toFixed(0)} % rejected` : ""];
     facts.push(["wheels", shown.filter(Boolean).join(", "), use === "disagrees"]);
   }
-  if (live && live.pose && live.pose.speed_mps !== null) facts.push(["robot", `x ${live.pose.at[0].toFixed(2)}, y ${live.pose.at[1].toFixed(2)}, z ${live.pose.at[2].toFixed(2)} m; ${live.pose.speed_mps.toFixed(1)} m/s`, false]);
+  if (live && live.pose && live.pose.valid && live.pose.speed_mps !== null) facts.push(["robot", `x ${live.pose.at[0].toFixed(2)}, y ${live.pose.at[1].toFixed(2)}, z ${live.pose.at[2].toFixed(2)} m; ${live.pose.speed_mps.toFixed(1)} m/s`, false]);
   rows(find("facts"), facts);
   find("storage").hidden = !facts.length;
 }

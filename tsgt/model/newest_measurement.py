@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from tsgt.model import Measurement
+    from tsgt.model.measurements import Measurement
 
 MAX_SEQUENCE_STEP = 100_000
 """By which a client continues its numbers, four restarts included. One that cannot write its journal takes random ones, up to 4 million above."""

@@ -152,7 +152,8 @@ def test_poses_before_a_replaced_set_up_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "r.jsonl"
     stream(path)
     run = path.read_bytes()
-    replaced, joined = encode_line(PARAMETERS) + b"\n", b"".join(run.splitlines(keepends=True)[3:])
+    moved = replace(PARAMETERS, stations=PARAMETERS.stations[::-1])
+    replaced, joined = encode_line(moved) + b"\n", b"".join(run.splitlines(keepends=True)[3:])
     path.write_bytes(run + replaced + joined)
     assert read_streamed_poses(path, ROBOT_ORIGIN)["predicted"].poses == 4
     path.write_bytes(run + run)

@@ -29,6 +29,8 @@ BEAT_INTERVAL_S = 1.0
 BACK_OFF_S = (0.1, 2.0)
 """Wait before the first further attempt to connect to the master, and the longest; it doubles in between."""
 
+REFUSED = "the connection was closed without a line; are there too many readers?"
+
 log = structlog.get_logger()
 
 
@@ -79,28 +81,34 @@ class SourceReader:
             try:
                 reader, writer = await asyncio.open_unix_connection(str(self._source), limit=MAX_LINE_BYTES)
             except OSError as error:
-                if problem != (problem := error.strerror or str(error)):
-                    log.warning("relay_source_missing", path=str(self._source), error=problem)
+                found = error.strerror or str(error)
             else:
-                back_off_s, problem = BACK_OFF_S[0], ""
-                self.connected = True
-                log.info("relay_source_connected", path=str(self._source))
                 try:
-                    await self._pass_on(reader)
+                    found = "" if await self._pass_on(reader) else REFUSED
                 finally:
                     self.connected = False
                     self._server.buffer.source_lost()
                     writer.close()
                     with suppress(OSError):
                         await writer.wait_closed()
+            if not found:
+                back_off_s = BACK_OFF_S[0]
                 log.warning("relay_source_lost", path=str(self._source))
+            elif found != problem:
+                log.warning("relay_source_missing", path=str(self._source), error=found)
+            problem = found
             await asyncio.sleep(back_off_s)
             back_off_s = min(2 * back_off_s, BACK_OFF_S[1])
 
-    async def _pass_on(self, reader: asyncio.StreamReader) -> None:
+    async def _pass_on(self, reader: asyncio.StreamReader) -> bool:
+        """Pass the lines of a connection on; return whether there were any: a master with too many readers sends none."""
         with suppress(ConnectionError, ValueError):  # ValueError: a line that is too long
             while (line := await reader.readline()).endswith(b"\n"):
+                if not self.connected:
+                    self.connected = True
+                    log.info("relay_source_connected", path=str(self._source))
                 self._server.line(line[:-1])
+        return self.connected
 
 
 async def _beats(server: RelayServer, source: SourceReader) -> NoReturn:

@@ -97,13 +97,13 @@ class RelayServer:
     def line(self, line: bytes) -> None:
         """Add a line, without line end, and send it."""
         self.buffer.append(line, self.now_ns())
-        for reader in self.readers:
+        for reader in [*self.readers]:
             reader.send_lines()
 
     def beat(self, *, connected: bool) -> None:
         """Send a sign of life to readers that have everything."""
         frame = self.buffer.beat(self.now_ns(), connected=connected)
-        for reader in self.readers:
+        for reader in [*self.readers]:
             reader.send_beat(frame)
 
     def reject(self, address: str, reason: str) -> None:
@@ -242,13 +242,16 @@ class _Connection(asyncio.Protocol):
             self.send_lines()
 
     def abort(self) -> None:
-        """Close at once."""
-        self._server.pending.pop(self, None)
+        """Close at once; nothing is sent any more."""
+        self._forget()
         self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (the reason does not matter)
-        server = self._server
         self._stop_timer()
+        self._forget()
+
+    def _forget(self) -> None:
+        server = self._server
         server.pending.pop(self, None)
         if self in server.readers:
             server.readers.discard(self)
@@ -259,11 +262,15 @@ class _Connection(asyncio.Protocol):
             self._timer.cancel()
 
     def _write(self, data: bytes) -> None:
+        if (
+            self._transport.is_closing()
+        ):  # asyncio logs writes to a reader that has gone, and its TLS may have failed
+            return
         if self._tls is not None:
             if data:
                 self._tls.send(data)
             data = self._tls.outgoing()
-        if data and not self._transport.is_closing():  # asyncio logs writes to a reader that has gone
+        if data:
             self._transport.write(data)
 
     def _too_slow(self) -> None:

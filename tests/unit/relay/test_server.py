@@ -155,6 +155,27 @@ def test_reader_cannot_write() -> None:
     asyncio.run(main())
 
 
+def test_damaged_tls_record_ends_one_reader_alone(certificate: tuple[ssl.SSLContext, str]) -> None:
+    """A line or a sign of life may follow before the event loop knows of the disconnection."""
+    damaged = b"\x17\x03\x03\x00\x20" + bytes(32)
+
+    async def main() -> None:
+        async with relay(certificate) as server:
+            source = f"relays://{LOOPBACK}:{server.port}"
+            async with AsyncStream(source, key=KEY) as stream, AsyncStream(source, key=KEY) as other:
+                await asyncio.wait_for(taken(stream, 2), 5)
+                (damaging,) = server.readers
+                await asyncio.wait_for(taken(other, 2), 5)
+                damaging.data_received(damaged)
+                server.line(pose_line(0))
+                server.beat(connected=True)
+                damaging.send_lines()
+                assert len(server.readers) == 1
+                assert [type(record) for record in await asyncio.wait_for(taken(other, 1), 5)] == [Pose]
+
+    asyncio.run(main())
+
+
 @contextmanager
 def connections(port: int, count: int) -> Iterator[list[socket.socket]]:
     """Open connections that say nothing."""

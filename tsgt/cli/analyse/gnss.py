@@ -23,7 +23,7 @@ from tsgt.analysis.gnss import (
 )
 from tsgt.analysis.validation import check_time_span, plausible_measurements
 from tsgt.cli.analyse.options import figure_option
-from tsgt.cli.options import json_option, keep_going_option, path_type
+from tsgt.cli.options import FiniteRange, json_option, keep_going_option, path_type
 from tsgt.cli.output import numbers, print_json, print_table, require_extra
 from tsgt.cli.progress import progress
 from tsgt.cli.recordings import load
@@ -47,7 +47,7 @@ _ERROR_COLUMNS = ("mean |error|", "std |error|", "p95 |error|", "max |error|")
 @click.option(
     "--reference-mm",
     "references_mm",
-    type=click.FloatRange(min=0.0, min_open=True, max=1e6),
+    type=FiniteRange(min=0.0, min_open=True, max=1e6),
     multiple=True,
     help="Distance between two receivers, once per pair in the order of the files: 1-2, 1-3, ..., 2-3.  "
     "[default: median of the fixed solutions]",
@@ -124,8 +124,6 @@ def _references_m(files: Sequence[Path], references_mm: Sequence[float]) -> list
         raise click.UsageError("a file is given twice")
     if not references_mm:
         return None
-    if not all(map(math.isfinite, references_mm)):
-        raise click.UsageError("--reference-mm takes finite numbers")
     names = [f"{a}-{b}" for a, b in combinations(range(1, len(files) + 1), 2)]
     if len(references_mm) != len(names):
         raise click.UsageError(

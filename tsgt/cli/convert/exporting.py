@@ -14,6 +14,7 @@ from tsgt.analysis.formats import measurement_csv, messages, pose_csv, tum_lines
 from tsgt.analysis.processing import process
 from tsgt.cli.desk.unused_options import refuse_unused_by_linear, refuse_unused_wheels
 from tsgt.cli.options import (
+    FiniteRange,
     keep_going_option,
     path_type,
     point_option,
@@ -75,7 +76,7 @@ FORMATS = {".tum": "tum", ".csv": "csv", ".mcap": "mcap"}
 )
 @click.option(
     "--delay-s",
-    type=click.FloatRange(min=0, min_open=True),
+    type=FiniteRange(min=0, min_open=True),
     help="Smoothed poses of this delay, as they were streamed before the final ones.  [default: the final ones]",
 )
 @click.option(

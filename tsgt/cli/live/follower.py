@@ -6,7 +6,7 @@ import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from tsgt.cli.live.line_reader import connect
+from tsgt.cli.live.line_reader import check_version, connect
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -33,7 +33,10 @@ class StreamFollower:
         self.problem = "not connected yet"
 
     def lines(self, until_s: float) -> Iterator[bytes]:
-        """Yield the lines that arrive before a deadline on the monotonic clock in s, and wait for it."""
+        """Yield the lines that arrive before a deadline on the monotonic clock in s, and wait for it.
+
+        Raises StreamError for a stream of another protocol version.
+        """
         while (now_s := time.monotonic()) < until_s:
             reader = self._reader
             if reader is None:
@@ -50,6 +53,7 @@ class StreamFollower:
                 self._disconnect(f"the connection is lost: {error}")
                 continue
             if line:
+                check_version(line)
                 yield line
             else:
                 self._disconnect("the stream has ended")

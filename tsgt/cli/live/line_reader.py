@@ -7,7 +7,9 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from tsgt.recording import MAX_LINE_BYTES
+from tsgt.client.build import load
+from tsgt.errors import StreamError
+from tsgt.recording import MAX_LINE_BYTES, PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -63,3 +65,18 @@ def connect(path: Path, timeout_s: float | None = None) -> Iterator[LineReader]:
         connection.settimeout(timeout_s)
         connection.connect(str(path))
         yield LineReader(connection)
+
+
+def check_version(line: bytes) -> None:
+    """Raise StreamError for the greeting of another protocol version: fields may have another meaning."""
+    if b'"hello"' not in line:
+        return
+    try:
+        data = load(line)
+    except StreamError:  # a line that cannot be read is no greeting
+        return
+    if data["type"] == "hello" and data.get("protocol") != PROTOCOL_VERSION:
+        raise StreamError(
+            f"the stream has protocol version {data.get('protocol')}, this program supports version {PROTOCOL_VERSION}; "
+            "use the tsgt of the stream's version"
+        )

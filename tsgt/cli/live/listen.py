@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tsgt.cli.live.line_reader import connect
+from tsgt.cli.live.line_reader import check_version, connect
 from tsgt.cli.live.pose_text import measurement_block, pose_block
 from tsgt.cli.live.status_text import wrapped
 from tsgt.cli.live.stream_filter import KINDS, StreamFilter
@@ -210,7 +210,7 @@ class _Newest:
 
 def _lines(socket_path: Path, refresh_s: float | None = None) -> Iterator[bytes]:
     """Yield the lines of the stream, and nothing in between at an interval."""
-    connected = False
+    connected = received = False
     try:
         with connect(socket_path) as reader:
             connected = True
@@ -224,10 +224,12 @@ def _lines(socket_path: Path, refresh_s: float | None = None) -> Iterator[bytes]
                 except TimeoutError:
                     continue
                 if not line:
-                    return
+                    break
+                received = True
+                check_version(line)
                 yield line
     except ConnectionResetError:  # the server closes the connection of a reader that is too slow at the end
-        return
+        pass
     except ValueError as error:
         raise StreamError(f"{socket_path}: not a stream of tsgt: {error}") from error
     except OSError as error:
@@ -237,3 +239,7 @@ def _lines(socket_path: Path, refresh_s: float | None = None) -> Iterator[bytes]
             f"{socket_path}: no stream ({error.strerror or error}); start tsgt-master, tsgt demo or tsgt replay, or "
             "give the right --socket"
         ) from error
+    if not received:
+        raise StreamError(
+            f"{socket_path}: the connection was closed without a line; are there too many readers?"
+        )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tsgt.cli.options import path_type, socket_option
+from tsgt.cli.options import FiniteRange, path_type, socket_option
 from tsgt.client.relay_wire import DEFAULT_PORT
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def _make_key(ctx: click.Context, param: click.Parameter, path: Path | None) -> 
 @click.option("--private-key", type=path_type, help="Private key of the certificate (PEM).")
 @click.option(
     "--hold-s",
-    type=click.FloatRange(0, 3600),
+    type=FiniteRange(0, 3600),
     default=120.0,
     help="Time in s for which lines are held for readers whose connection was lost; at most 32 MiB.",
 )

@@ -56,7 +56,7 @@ def status(socket_path: Path | None, *, as_json: bool, watch: bool) -> int:
 
     Exit code 1: no daemon runs. 3: a daemon runs, but action is required: a station is not received or does not track,
     the IMU gives no samples, disagrees with the prisms or is not confirmed, the disk is full or fails, or no pose is
-    valid. With --watch always 0.
+    valid. With --watch 0, or 1 if the stream has another protocol version.
     """
     if watch:
         paths = [DEFAULT_SOCKET, DEFAULT_CLIENT_SOCKET] if socket_path is None else [socket_path]

@@ -108,7 +108,7 @@ def test_prism_distances_of_a_recording_are_added(
             2,
             "2 receivers have 1 distances (1-2)",
         ),
-        (["front.pos", "back.pos", "--reference-mm", "nan"], 2, "finite numbers"),
+        (["front.pos", "back.pos", "--reference-mm", "nan"], 2, "nan is not a finite number"),
         (["front.pos", "none.pos"], 1, "none.pos: No such file or directory"),
         (["front.pos", "later.pos"], 1, "front.pos: the receivers do not overlap in time"),
         (["front.pos", "back.pos", "--figure", "x.gif"], 2, "known suffixes: .png, .pdf, .svg"),

@@ -170,6 +170,7 @@ def test_invalid_poses_have_no_message(tsgt: Tsgt, tmp_path: Path) -> None:
         (["--format", "mcap", "--output", "x", "--reference-point", "1,1,1"], "needs --reference"),
         (["--format", "csv", "--records", "measurements", "--kind", "predicted"], "choose poses"),
         (["--format", "csv", "--records", "measurements", "--delay-s", "1"], "choose poses"),
+        (["--format", "tum", "--delay-s", "nan"], "nan is not a finite number"),
         (["--format", "csv", "--records", "measurements", "--point", "1,2,3"], "choose poses"),
         (["--format", "csv", "--records", "measurements", "--no-imu"], "choose poses"),
     ],

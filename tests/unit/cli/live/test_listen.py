@@ -75,11 +75,23 @@ def test_unknown_types_and_keys_are_ignored(tsgt: Tsgt, tmp_path: Path) -> None:
     assert outcome.err == ""
 
 
-def test_other_protocol_version_is_a_warning(tsgt: Tsgt, tmp_path: Path) -> None:
-    """The first line has a warning."""
+@pytest.mark.parametrize("options", [(), ("--json",), ("--kind", "pose")])
+def test_other_protocol_version_is_refused(tsgt: Tsgt, tmp_path: Path, options: tuple[str, ...]) -> None:
+    """Its fields may have another meaning."""
     hello = json.dumps(json.loads(encode_line(HELLO)) | {"protocol": 2}).encode()
-    with serving(tmp_path / "s", hello + b"\n"):
-        assert "made for protocol 1" in tsgt("listen", "--socket", tmp_path / "s").out
+    with serving(tmp_path / "s", hello + b"\n" + encode_line(POSE) + b"\n"):
+        outcome = tsgt("listen", "--socket", tmp_path / "s", *options)
+    assert outcome.code == 1
+    assert outcome.out == ""
+    assert "protocol version 2" in outcome.err
+
+
+def test_connection_without_a_line_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
+    """As a master closes it that has too many readers."""
+    with serving(tmp_path / "s", b""):
+        outcome = tsgt("listen", "--socket", tmp_path / "s")
+    assert outcome.code == 1
+    assert "closed without a line; are there too many readers?" in outcome.err
 
 
 def test_invalid_line_is_reported(tsgt: Tsgt, tmp_path: Path) -> None:

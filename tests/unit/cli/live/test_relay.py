@@ -38,6 +38,14 @@ def test_bad_addresses_are_usage_errors(tsgt: Tsgt, tmp_path: Path, address: str
     assert "is not ADDRESS" in outcome.err
 
 
+def test_hold_of_no_number_is_a_usage_error(tsgt: Tsgt, tmp_path: Path) -> None:
+    """Before anything is opened."""
+    tsgt("relay", "--make-key", tmp_path / "k")
+    outcome = tsgt("relay", "--key", tmp_path / "k", "--hold-s", "nan")
+    assert outcome.code == 2
+    assert "nan is not a finite number" in outcome.err
+
+
 def test_address_of_another_computer_is_an_error(tsgt: Tsgt, tmp_path: Path) -> None:
     """One line says what to do."""
     tsgt("relay", "--make-key", tmp_path / "k")

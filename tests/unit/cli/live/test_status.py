@@ -544,6 +544,23 @@ def test_watch_goes_on_after_unreadable_lines(
     assert len(outcome.err.splitlines()) == 1
 
 
+def test_watch_refuses_another_protocol_version(
+    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Connecting again would not help."""
+
+    def interrupt(_delay_s: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tsgt.cli.live.follower.time.sleep", interrupt)
+    hello = encode_line(dataclasses.replace(HelloRecord(), protocol=2))
+    with serving(tmp_path / "s", hello + b"\n" + encode_line(MASTER) + b"\n"):
+        outcome = tsgt("status", "--watch", "--socket", tmp_path / "s")
+    assert outcome.code == 1
+    assert outcome.out == ""
+    assert "protocol version 2" in outcome.err
+
+
 def test_watch_warns_of_a_status_that_it_cannot_read(
     tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

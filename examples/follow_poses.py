@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-from tsgt.client import Event, Gap, Pose, Stream
+from tsgt.client import Event, Gap, Pose, Stream, default_max_age_s
 
 
 def follow(source: str, key: str | None) -> None:
@@ -21,7 +21,7 @@ def follow(source: str, key: str | None) -> None:
             elif isinstance(record, Pose) and record.kind != "smoothed":
                 if not record.valid:
                     print(f"no pose: {record.reason}", flush=True)
-                elif record.position_m is not None and record.age_s() < 0.5:
+                elif record.position_m is not None and record.age_s() <= default_max_age_s(record):
                     x, y, z = record.position_m
                     print(f"{record.stamp_ns} ns: {x:.3f} {y:.3f} {z:.3f} m", flush=True)
 

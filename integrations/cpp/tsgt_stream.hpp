@@ -81,7 +81,8 @@ inline std::int64_t sum(std::int64_t a, std::int64_t b) {
 }  // namespace detail
 
 // ---------------------------------------------------------------------------------------------------------------------
-// JSON, as far as lines of the stream need it. Integers keep all 64 bits, numbers with a fraction become the nearest double.
+// JSON, as far as lines of the stream need it. Integers keep all 64 bits; larger ones, and numbers with a
+// fraction, become the nearest double.
 
 namespace json {
 
@@ -218,20 +219,21 @@ class Parser {
     const char* end = text_.data() + at_;
     if (whole) {
       std::int64_t integer = 0;
-      const auto [rest, error] = std::from_chars(begin, end, integer);
-      if (error != std::errc() || rest != end) fail();
-      value.data = integer;
-      return;
+      if (std::from_chars(begin, end, integer).ec == std::errc()) {
+        value.data = integer;
+        return;
+      }
     }
     double number = 0;
 #if defined(__cpp_lib_to_chars) && __cpp_lib_to_chars >= 201611L
-    const auto [rest, error] = std::from_chars(begin, end, number);
-    if (error != std::errc() || rest != end) fail();
-#else
-    std::istringstream stream(std::string(begin, end));
-    stream.imbue(std::locale::classic());
-    if (!(stream >> number) || stream.peek() != std::istringstream::traits_type::eof()) fail();
+    if (std::from_chars(begin, end, number).ec == std::errc()) {
+      value.data = number;
+      return;
+    }
 #endif
+    std::istringstream stream(std::string(begin, end));  // tells too small, which is nearly 0, from too large
+    stream.imbue(std::locale::classic());
+    if (!(stream >> number) && !(std::abs(number) < 1)) fail();
     value.data = number;
   }
 

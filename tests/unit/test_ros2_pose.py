@@ -17,6 +17,7 @@ from harness.readers.web import station
 
 from tsgt.client import Hello, Pose, Setup, StationStatus, Status, records
 from tsgt.client.build import build, load
+from tsgt.errors import ConfigError
 from tsgt.model import Status as MeasurementStatus
 from tsgt.recording import LOW_BATTERY_PERCENT, encode_line
 from tsgt.recording.conditions import MAX_AGE_S, MAX_UNASKED_S, StationCondition, station_condition
@@ -36,6 +37,7 @@ class RosNode:
     """A node that keeps what it publishes, by topic."""
 
     parameters: dict[str, str]
+    logger: MagicMock
 
     def __init__(self, _name: str) -> None:
         self.published: dict[str, list[Any]] = {}
@@ -50,6 +52,10 @@ class RosNode:
 
     def create_timer(self, _period_s: float, _callback: Any) -> None:
         """Make none: the test calls."""
+
+    def get_logger(self) -> MagicMock:
+        """Return the logger of all nodes of a test."""
+        return self.logger
 
     def get_clock(self) -> Any:
         """Return a clock whose time nobody looks at."""
@@ -78,6 +84,7 @@ def publisher(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     def make(**parameters: str) -> Any:
         monkeypatch.setattr(RosNode, "parameters", parameters, raising=False)
+        monkeypatch.setattr(RosNode, "logger", MagicMock(), raising=False)
         node = module.PosePublisher()
         node.stream = SimpleNamespace(problem="")
         return node
@@ -273,3 +280,22 @@ def test_stations_are_stale_when_no_status_comes(publisher: Any, monkeypatch: py
     node.take(pose(-5.0))
     assert diagnosis(node) == (OK, "good")
     assert diagnosis(node, "station 1") == (STALE, "no status for 5 s")
+
+
+def test_frame_of_another_reference_point_is_not_named_robot(publisher: Any) -> None:
+    """The prisms hang on the frame `robot`, and would hang on the reference point."""
+    node = publisher(robot_frame="robot")
+    node.take(setup(child_frame="robot"))
+    with pytest.raises(ConfigError, match="robot_frame is 'robot', but poses are those of 'imu_link'"):
+        node.take(setup(child_frame="imu_link"))
+
+
+@pytest.mark.parametrize("source", ["relay://robot:99999", "http://robot"])
+def test_wrong_source_is_one_line(publisher: Any, monkeypatch: pytest.MonkeyPatch, source: str) -> None:
+    """And the exit code is 1."""
+    node = publisher(source=source)
+    names = type(node).take.__globals__
+    monkeypatch.setitem(names, "signal", MagicMock())
+    assert names["main"]() == 1
+    ((message,), _) = node.logger.fatal.call_args
+    assert message.startswith(f"parameter source: {source}: expected the path of a socket")

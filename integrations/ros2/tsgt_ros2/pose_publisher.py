@@ -39,7 +39,7 @@ from tsgt.client import (
     measured_point,
     monotonic_ns,
 )
-from tsgt.errors import TsgtError
+from tsgt.errors import ConfigError, TsgtError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -189,7 +189,12 @@ class PosePublisher(Node):  # type: ignore[misc]  # rclpy has no types
         point = setup.reference_point
         parent = self._robot_frame or setup.child_frame
         robot = parent if setup.child_frame == "robot" else "robot"
-        if robot != parent:
+        if setup.child_frame != "robot":
+            if parent == robot:
+                raise ConfigError(
+                    f"parameter robot_frame is 'robot', but poses are those of {setup.child_frame!r}, and `robot` is the "
+                    "frame of the prisms: choose another name"
+                )
             x, y, z, w = point.orientation_xyzw
             position = rotated_back(tuple(-value for value in point.position_m), point.orientation_xyzw)
             transforms.append(
@@ -369,7 +374,7 @@ def main() -> int:
     spinning = threading.Thread(target=_spin, args=(node,))
     spinning.start()
     try:
-        with Stream(node.source, key=node.key_file or None) as stream:
+        with _stream(node) as stream:
             node.stream = stream
             for record in stream:
                 node.take(record)
@@ -382,6 +387,13 @@ def main() -> int:
         rclpy.try_shutdown()
         spinning.join()
     return 0
+
+
+def _stream(node: PosePublisher) -> Stream:
+    try:
+        return Stream(node.source, key=node.key_file or None)
+    except ValueError as error:
+        raise ConfigError(f"parameter source: {error}") from error
 
 
 def _spin(node: Node) -> None:

@@ -323,6 +323,35 @@ def test_what_is_no_number_is_a_gap(program: Path, tmp_path: Path, number: bytes
     assert found[1] == "gap 1 a line cannot be used: not JSON"
 
 
+@pytest.mark.parametrize(
+    "number",
+    [b"9223372036854775808", b"18446744073709551615", b"-9223372036854775809", b"1e-400", b"-1e-400"],
+)
+def test_number_beyond_its_type_costs_no_pose(program: Path, tmp_path: Path, number: bytes) -> None:
+    """It becomes the nearest double, also where the program does not use it."""
+    pose = encode_line(AWKWARD)[:-1] + b',"later":%s}' % number
+    with (
+        serving(tmp_path / "s", lines(HELLO, pose)),
+        printing(program, tmp_path, str(tmp_path / "s")) as example,
+    ):
+        example.wait_for_lines(2)
+        found = example.output.read_text().splitlines()
+    assert found[1].startswith(f"pose {AWKWARD.stamp_ns} ")
+
+
+@pytest.mark.parametrize("number", [b"1e400", b"-1e400", 400 * b"9"])
+def test_number_that_no_double_holds_is_a_gap(program: Path, tmp_path: Path, number: bytes) -> None:
+    """All numbers are finite."""
+    line = b'{"type":"weather","x":%s}' % number
+    with (
+        serving(tmp_path / "s", lines(HELLO, line)),
+        printing(program, tmp_path, str(tmp_path / "s")) as example,
+    ):
+        example.wait_for_lines(2)
+        found = example.output.read_text().splitlines()
+    assert found[1] == "gap 1 a line cannot be used: not JSON"
+
+
 KINDS = """
 #include <cstdio>
 #include "tsgt_stream.hpp"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from harness.files.records import EVENT, HELLO, NO_POSE, POSE, SETUP, measurement
+from harness.files.records import EVENT, HELLO, NO_POSE, POSE, SETUP, STATUS, measurement
 from harness.files.stream_lines import lines, serving
 from harness.missions.processes import ROOT, TIMEOUT_S, Program
 
@@ -64,6 +65,21 @@ def test_example_with_the_client_follows_the_stream(tmp_path: Path) -> None:
         "event: lost 7 lines",
         "gap: 7 lines (this reader was too slow for the master)",
     ]
+
+
+def test_example_with_the_client_prints_interpolated_poses(tmp_path: Path) -> None:
+    """They wait for the next measurement of each prism, so they are older than predicted ones by nature."""
+    now_ns = time.time_ns()
+    pose = replace(POSE, kind="interpolated", stamp_ns=now_ns - 800_000_000)
+    path, command = (
+        tmp_path / "s",
+        [sys.executable, str(ROOT / "examples" / "follow_poses.py"), str(tmp_path / "s")],
+    )
+    served = lines(HELLO, replace(STATUS, stamp_ns=now_ns), pose, EVENT)
+    with serving(path, served), Program(command, tmp_path, "example") as example:
+        example.wait_for_lines(2)
+        printed = example.output.read_text().splitlines()
+    assert printed[0] == f"{pose.stamp_ns} ns: 1.000 2.000 -0.100 m"
 
 
 def test_example_stops_at_another_protocol(tmp_path: Path) -> None:

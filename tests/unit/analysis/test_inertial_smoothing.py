@@ -128,6 +128,7 @@ def test_samples_of_another_day_are_an_error_of_two_stations() -> None:
         smooth(replace(recording, imu_samples=later))
 
 
+@pytest.mark.slow
 def test_third_prism_that_is_not_measured_tells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two stations are two, whatever the layout: poses around a contradiction are left out, too."""
     window = UnusedInterval(10.0, 15.0, "contradiction")

@@ -602,6 +602,7 @@ def test_innovations_are_no_evidence_where_missing_samples_lose_the_rotation(*, 
     assert live.window.beyond_chance is not missing
 
 
+@pytest.mark.slow
 def test_innovations_are_no_evidence_after_an_outage_that_leaves_the_position_uncertain() -> None:
     """The position is uncertain by metres and the rotation by 30 mrad: the prediction of what comes together is not linear."""
     imu, drive = imu_parameters("consumer"), inertial_drive(28.0, seed=7)

@@ -221,7 +221,9 @@ def _note_kept_corrections(parameters: Parameters, calibration: StationCalibrati
         if new is not None and new.range_scale_ppm is None and station.atmospheric_ppm:
             kept.append(f"distance scale {station.atmospheric_ppm:g} ppm of station {station.station}")
     if kept:
-        click.echo(f"note: {path} has no other value, so it stays as recorded: {', '.join(kept)}", err=True)
+        click.echo(
+            f"note: {path} does not state these, so they stay as recorded: {', '.join(kept)}", err=True
+        )
 
 
 def calibrated(recording: Recording, path: Path) -> Recording:

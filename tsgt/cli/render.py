@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from tsgt.cli.output import printable
 from tsgt.model import PointMeasurement, PolarMeasurement
 from tsgt.recording import (
-    PROTOCOL_VERSION,
     ClockRecord,
     EventRecord,
     HelloRecord,
@@ -71,8 +70,6 @@ def _hello(hello: HelloRecord) -> str:
         text += f". Valid: {hello.limits.promise}{_limits(hello.limits)}"
     if hello.no_poses is not None:
         text += f". No poses: {printable(hello.no_poses)}"
-    if hello.protocol != PROTOCOL_VERSION:
-        text += f" (this program is made for protocol {PROTOCOL_VERSION}; values may be wrong, use a matching tsgt listen)"
     return text
 
 

@@ -62,7 +62,7 @@ class Recording:
     header: RecordingHeader  # of the first run of the master
     parameters: Parameters  # the last ones in the file
     measurements: list[Measurement]
-    """In the order of arrival, merged ones at their place in the file; one that several runs have only once."""
+    """In the order of arrival, merged ones at their place in the file; each once, also if several runs have it."""
     end_ns: int | None
     """Latest arrival, status or event in the file, on the master's Unix clock in ns; None without any."""
     imu_samples: list[ImuSamples] = field(
@@ -81,7 +81,7 @@ class _Stamped:
 
 
 class _Origin(NamedTuple):
-    """Where a measurement comes from: a run of the master, by its number in the file, and of that the radio or a journal."""
+    """Where a measurement comes from: the number of the master's run in the file, and whether it was merged from a journal."""
 
     run: int
     merged: bool

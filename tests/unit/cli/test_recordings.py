@@ -100,7 +100,7 @@ def test_corrections_that_a_calibration_lacks_are_named(
     write_station_frames(frames, identity, {}, comment="by a test")
     load(path, keep_going=False, frames=frames)
     said = capsys.readouterr().err
-    assert "stays as recorded: latency 30 ms of station 1, distance scale 200 ppm of station 1" in said
+    assert "they stay as recorded: latency 30 ms of station 1, distance scale 200 ppm of station 1" in said
     write_station_frames(frames, identity, {}, comment="by a test", latencies_ms=dict.fromkeys(identity, 1.0))
     load(path, keep_going=False, frames=frames)
     assert "latency" not in capsys.readouterr().err

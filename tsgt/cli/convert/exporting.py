@@ -158,7 +158,7 @@ def export(
         reference = load_reference(reference_path, reference_point, loaded.parameters)
         poses = _poses_of(recording, series, point, imu, keep_going=keep_going, loaded=loaded)
         with write_atomically(output) as file:
-            write_mcap(file, messages(loaded, _noting_none(poses, recording), reference))
+            write_mcap(file, messages(loaded, _noting_none_valid(poses, recording), reference))
         return
     lines: Iterable[str]
     if records == "measurements":
@@ -172,7 +172,7 @@ def export(
         lines = (
             pose_csv(poses)
             if format_name == "csv"
-            else tum_lines(_not_none(valid_records(poses), recording), point)
+            else tum_lines(_at_least_one(valid_records(poses), recording), point)
         )
     if output == STDOUT:
         sys.stdout.writelines(lines)
@@ -180,7 +180,7 @@ def export(
         write_lines(output, lines)
 
 
-def _not_none(valid: Iterable[T], path: Path) -> Iterator[T]:
+def _at_least_one(valid: Iterable[T], path: Path) -> Iterator[T]:
     """Yield what is in a list of valid poses; raises RecordingError if nothing is."""
     poses = iter(valid)
     first = next(poses, None)
@@ -190,7 +190,7 @@ def _not_none(valid: Iterable[T], path: Path) -> Iterator[T]:
     yield from poses
 
 
-def _noting_none(poses: Iterable[PoseRecord], path: Path) -> Iterator[PoseRecord]:
+def _noting_none_valid(poses: Iterable[PoseRecord], path: Path) -> Iterator[PoseRecord]:
     """Yield poses; say so if none is valid: of those an MCAP file has only the prisms."""
     some = False
     for pose in poses:

@@ -148,6 +148,8 @@ def evaluate(
     Prints a verdict, then internal consistency (distances between prisms, which are constant on a rigid robot;
     residuals against the stated noise), held-out prediction errors, and errors against a reference. Errors and sigmas of
     positions are those of the robot's origin, or of --point, and of the centroid of the prisms.
+
+    Exit code 3: the report was written, but there are no poses, or they could not be compared with the reference.
     """
     if odometry is not None and report_folder is None:
         raise click.UsageError("--odometry needs --report")

@@ -525,16 +525,20 @@ def test_drain_of_a_backlog_is_shown(
     assert [entry.strip() for entry in shown] == ([line.strip()] if line else [])
 
 
-@pytest.mark.parametrize("as_json", [False, True])
-def test_watch_goes_on_after_unreadable_lines(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, as_json: bool
-) -> None:
-    """Each is a warning; a line that the end of the connection has cut is dropped."""
+@pytest.fixture
+def interrupted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Press Ctrl-C when the command would connect again."""
 
     def interrupt(_delay_s: float) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tsgt.cli.live.follower.time.sleep", interrupt)  # Ctrl-C when it would connect again
+    monkeypatch.setattr("tsgt.cli.live.follower.time.sleep", interrupt)
+
+
+@pytest.mark.usefixtures("interrupted")
+@pytest.mark.parametrize("as_json", [False, True])
+def test_watch_goes_on_after_unreadable_lines(tsgt: Tsgt, tmp_path: Path, *, as_json: bool) -> None:
+    """Each is a warning; a line that the end of the connection has cut is dropped."""
     line = encode_line(MASTER)
     with serving(tmp_path / "s", b"".join([b'["noise"]\n', line, b"\n", line[:60]])):
         outcome = tsgt("status", "--watch", "--socket", tmp_path / "s", *(["--json"] if as_json else []))
@@ -544,15 +548,9 @@ def test_watch_goes_on_after_unreadable_lines(
     assert len(outcome.err.splitlines()) == 1
 
 
-def test_watch_refuses_another_protocol_version(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("interrupted")
+def test_watch_refuses_another_protocol_version(tsgt: Tsgt, tmp_path: Path) -> None:
     """Connecting again would not help."""
-
-    def interrupt(_delay_s: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("tsgt.cli.live.follower.time.sleep", interrupt)
     hello = encode_line(dataclasses.replace(HelloRecord(), protocol=2))
     with serving(tmp_path / "s", hello + b"\n" + encode_line(MASTER) + b"\n"):
         outcome = tsgt("status", "--watch", "--socket", tmp_path / "s")
@@ -561,15 +559,9 @@ def test_watch_refuses_another_protocol_version(
     assert "protocol version 2" in outcome.err
 
 
-def test_watch_warns_of_a_status_that_it_cannot_read(
-    tsgt: Tsgt, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("interrupted")
+def test_watch_warns_of_a_status_that_it_cannot_read(tsgt: Tsgt, tmp_path: Path) -> None:
     """As one of a newer version."""
-
-    def interrupt(_delay_s: float) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("tsgt.cli.live.follower.time.sleep", interrupt)
     with serving(tmp_path / "s", b'{"type":"status"}\n{"type":"client_status"}\n'):
         outcome = tsgt("status", "--watch", "--socket", tmp_path / "s")
     assert outcome.code == 0

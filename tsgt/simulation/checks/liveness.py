@@ -41,6 +41,9 @@ age of the newest measurement.
 MAX_MISFIT_M = 0.002
 """No poses are expected if stations that have moved distort the prisms' triangle by more: the measurements contradict each other."""
 
+START_MOVE_M, START_S = 0.3, 5.0
+"""With one station a trajectory is not searched before the robot has moved so far, and found within this time."""
+
 CONTRADICTION_S, SETUP_CHECK_S = 5.0, 50.0
 """Measurements of these times before the events ``station_contradicted`` and ``imu_setup_wrong`` are looked at for their cause."""
 
@@ -83,22 +86,33 @@ def liveness_failures(result: MissionResult, indices: Mapping[int, JournalIndex]
     at_s = (
         poses.stamp_ns[np.isin(poses.series, ("interpolated", "smoothed"))] - master_log.unix_at_zero_ns
     ) / 1e9
-    valid = np.count_nonzero((from_s <= at_s) & (at_s < to_s))
+    due_s = poses_due_from_s(result, from_s, to_s)
+    valid = np.count_nonzero((due_s <= at_s) & (at_s < to_s))
     min_valid_share = pose_share(
         protocol,
         stations=len(result.parameters.stations),
         knocked=FaultKind.IMU_KNOCK in result.faults,
         contradicted=contradicted_by_station(result, master_log, indices, from_s),
     )
-    expected = seconds * 1e9 / result.parameters.pipeline.period_ns
+    expected = (to_s - due_s) * 1e9 / result.parameters.pipeline.period_ns
     misfit_m = apparent_poses(result, master_log, np.arange(from_s, to_s)).misfit_m
     if misfit_m.max(initial=0.0) > MAX_MISFIT_M:
         min_valid_share = 0.0
     if valid < min_valid_share * expected:
         yield (
-            f"poses: {valid} of {expected:.0f} in the {seconds:g} s from {from_s:g} s on valid, "
+            f"poses: {valid} of {expected:.0f} in the {to_s - due_s:g} s from {due_s:g} s on valid, "
             f"minimum share {min_valid_share:g}"
         )
+
+
+def poses_due_from_s(result: MissionResult, from_s: float, to_s: float) -> float:
+    """Return the time from which poses are due: with one station not before the robot has moved, because standing tells no heading."""
+    if len(result.parameters.stations) > 1:
+        return from_s
+    times_s = np.arange(from_s - RECOVERY_TIME_S, to_s, 0.1)
+    positions = result.true_poses(times_s)[:, :3, 3]
+    moved = np.flatnonzero(np.linalg.norm(positions - positions[0], axis=1) > START_MOVE_M)
+    return min(max(from_s, times_s[moved[0]] + START_S), to_s) if len(moved) else to_s
 
 
 def pose_share(protocol: str, *, stations: int, knocked: bool, contradicted: bool) -> float:

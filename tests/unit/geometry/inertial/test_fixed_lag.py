@@ -452,6 +452,25 @@ def test_heading_of_one_prism_gets_lost_while_the_robot_stands(seed: int) -> Non
     assert sigmas_rad[-1] > 5 * DEG
 
 
+@pytest.mark.slow
+def test_standing_tells_nothing_of_the_rotation_about_the_line_of_both_prisms() -> None:
+    """It rests on what is assumed of the accelerometer's bias; that one prism is lost for a while does not change that."""
+    imu = imu_parameters("consumer")
+    drive = standing_from(DRIVE, 0.5, until_s=15.0)
+    samples, observations = drive.samples(imu, seed=4), drive.measure(stations=2, seed=4)
+    observations = replace(observations, layout=observations.layout[:2] - CENTROID)
+    time_s = observations.time_s
+    live, sigmas_rad = Live(imu=imu), []
+    for some in (
+        observations.select(time_s < 8.0),
+        observations.select((time_s > 8.0) & ((observations.prism == 0) | (time_s > 13.0))),
+    ):
+        live.measure(some, samples)
+        _, covariance = live.window.trajectory().at(some.time_s[-1:], dim=6)
+        sigmas_rad.append(float(np.sqrt(np.linalg.eigvalsh(covariance[0, 3:, 3:])[-1])))
+    assert sigmas_rad[1] > 0.93 * sigmas_rad[0] > 8e-3
+
+
 def test_window_does_not_grow() -> None:
     """Numbers of measurements, knots and samples are bounded."""
     window = tracked().window

@@ -6,12 +6,18 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from harness.files.records import HEADER, measurement
 
 from tsgt.recording import encode_line
 from tsgt.recording.journal import JournalRecord
-from tsgt.simulation.checks.liveness import contradicted_by_station, follows_another, pose_share
+from tsgt.simulation.checks.liveness import (
+    contradicted_by_station,
+    follows_another,
+    pose_share,
+    poses_due_from_s,
+)
 from tsgt.simulation.instrument.model import ReportedDistance
 from tsgt.simulation.mission import JournalIndex, StationLog
 
@@ -27,6 +33,26 @@ def test_poses_are_expected_unless_a_needed_imu_is_knocked_or_contradicted() -> 
     assert pose_share("superframe", stations=2, knocked=True, contradicted=False) == 0.0
     assert pose_share("superframe", stations=2, knocked=False, contradicted=True) == 0.0
     assert pose_share("superframe", stations=3, knocked=False, contradicted=True) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("stations", "moves_at_s", "due_s"),
+    [(1, 0.0, 190.0), (1, 205.0, 210.3), (1, 218.0, 220.0), (1, 300.0, 220.0), (2, 205.0, 190.0)],
+)
+def test_no_pose_of_one_station_is_due_before_the_robot_has_moved(
+    stations: int, moves_at_s: float, due_s: float
+) -> None:
+    """After a start its heading shows only in motion, here of 1 m/s."""
+
+    def true_poses(times_s: np.ndarray) -> np.ndarray:
+        poses = np.tile(np.eye(4), (len(times_s), 1, 1))
+        poses[:, 0, 3] = np.maximum(times_s - moves_at_s, 0.0)
+        return poses
+
+    result: Any = SimpleNamespace(
+        parameters=SimpleNamespace(stations=[None] * stations), true_poses=true_poses
+    )
+    assert poses_due_from_s(result, 190.0, 220.0) == pytest.approx(due_s, abs=0.11)
 
 
 @pytest.mark.parametrize(("prism", "at_s", "expected"), [(2, 12.0, True), (2, 20.0, False), (1, 12.0, False)])

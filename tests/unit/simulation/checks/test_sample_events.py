@@ -58,3 +58,10 @@ def test_silence_that_follows_at_once_may_be_the_same(events: list[tuple[float, 
     """A device that gives a few samples in between may count as lost throughout."""
     arrival_s = np.concatenate([np.arange(0.0, 20.0, 0.05), [26.0, 26.05], np.arange(29.0, 60.0, 0.05)])
     assert len(list(missing_events(master_log(*events), arrival_s, "imu"))) == count
+
+
+def test_device_that_has_recovered_may_be_lost_again() -> None:
+    """Its samples arrive, and are not used for a clock that was set."""
+    events = [(21.2, "imu_lost"), (26.3, "imu_recovered"), (30.5, "imu_lost"), (31.5, "imu_recovered")]
+    assert not list(missing_events(master_log(*events), ARRIVAL_S, "imu"))
+    assert len(list(missing_events(master_log(events[0], *events[2:]), ARRIVAL_S, "imu"))) == 1

@@ -618,6 +618,7 @@ class InertialFixedLagSmoother(MeasurementWindow):
             np.concatenate([step[first], shared]),
             past.layout[past.prism].mean(axis=0) if len(past) else window.anchor.point,
             window.kinematics[0][first],
+            None if self._gyro_only is not None else self._gravity.vector(),
         )
         self._window = replace(window.select(slice(first, None)), anchor=anchor)
 

@@ -29,7 +29,8 @@ def missing_events(
 ) -> Iterator[str]:
     """Yield each silence, while the master ran, of whose begin or end it gave no event.
 
-    A device that falls silent again soon after a silence may count as lost throughout.
+    A device that falls silent again soon after a silence may count as lost throughout, and one that has recovered may be lost again
+    for a clock that was set.
 
     ``arrival_s``: (N,) of the samples, in their order, on true time.
     """
@@ -58,5 +59,8 @@ def missing_events(
             silent_again = due == recovered and np.any(
                 gap_s[np.searchsorted(arrival_s, from_s) : np.searchsorted(arrival_s, until_s)] > TIMEOUT_S
             )
-            if ran and not silent_again and newest(until_s) != due:
+            recovers = due == recovered and any(
+                from_s <= at_s <= until_s and name == due for at_s, name in events
+            )
+            if ran and not silent_again and not recovers and newest(until_s) != due:
                 yield f"silence from {begin_s:.1f} to {end_s:.1f} s: no event {due} by {until_s:.1f} s"

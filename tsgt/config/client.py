@@ -141,7 +141,7 @@ class BridgeInstrumentConfig(Model):
     command: Annotated[tuple[Argument, ...], Field(min_length=1)]
     """Program and arguments; it is restarted when it ends."""
     stall_timeout_s: Positive = 5.0
-    """A program without output for this long while it should measure is restarted."""
+    """A program that prints no valid line for this long while it should measure is restarted."""
     latency_ms: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
     """Latency from a measurement to the time that the program reports, subtracted from each timestamp."""
 

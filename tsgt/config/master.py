@@ -63,7 +63,7 @@ class StreamConfig(Model):
     mode: Annotated[str, Field(pattern=r"^0[0-7]{3}$")] = "0660"
     """Permissions of the socket, octal as for chmod."""
     queue_lines: Annotated[int, Field(ge=1)] = 2000
-    """Maximum backlog of a subscriber; a slower one loses lines, and receives their number."""
+    """Maximum number of lines that wait for a reader; a slower one loses lines, and is told how many."""
 
 
 class RecordingConfig(Model):

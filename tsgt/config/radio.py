@@ -102,13 +102,15 @@ class ClassicMasterConfig(ClassicConfig):
 
     # A longer exchange would count as stalled.
     reply_timeout_ms: Annotated[float, Field(gt=0, le=30_000)] = 250.0
-    """Reply timeout, in addition to the time on air of a long reply."""
+    """Time from the end of a request to the end of its reply, time on air included; longer where the time on air of the reply and
+    100 ms exceed it (SF 10 and above)."""
     initial_cycles: Annotated[int, Field(ge=1, le=1000)] = 50
     """Exchanges of the first synchronisation of each station."""
     resync_cycles: Annotated[int, Field(ge=1, le=1000)] = 5
     """Exchanges of each later synchronisation."""
     resync_interval_s: Annotated[float, Field(ge=1, le=1e6)] = 300.0
-    """Interval between synchronisations of a station; stations are staggered."""
+    """Interval between synchronisations of a station; stations are staggered. With the filter `regression` the first intervals are
+    30, 90 and 270 s."""
     clock_filter: Literal["regression", "paper"] = "regression"
     """Clock filter: `regression` estimates offset and skew, `paper` is the paper's low-pass with w = 0.1."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,12 +12,15 @@ from tsgt.config.files import KINDS, json_schema
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+_WIDE = 1000  # Bounds from here on only keep nonsense out
+
 _INTRODUCTION = """\
 # Configuration and set-up files
 
 Generated from the models (`make generated`); do not edit. All files are TOML. The key `kind` selects the kind of file;
-unknown keys are errors; a path is relative to the folder of the file that contains it. Commented examples are in
-`configs/`, and `tsgt config check FILE...` reports all problems of files.
+unknown keys are errors; a path is relative to the folder of the file that contains it. "required" for a key of a table that may
+be left out means: required if there is that table. Commented examples are in `configs/`, and `tsgt config check FILE...` reports all
+problems of files, also where keys do not go together.
 """
 
 
@@ -32,26 +36,29 @@ def _section(kind: str) -> str:
 
 
 def _tables(
-    model: dict[str, Any], definitions: dict[str, Any], heading: str, kind: str = ""
+    model: dict[str, Any], definitions: dict[str, Any], heading: str, title: str = "", kind: str = ""
 ) -> Iterator[str]:
-    """Yield the table of a model's keys, then the tables of its inner models."""
+    """Yield the table of a model's keys, then the tables of its inner models; ``title``: without that of the model."""
     own, within = [], []
     required = model.get("required", [])
     for key, field in model["properties"].items():
         inner, name = _inner_models(key, field, definitions, heading)
         if inner:
-            within += [(each, name, each_kind) for each_kind, each in inner.items()]
+            its_title = f"`{name}`, {'required' if key in required else 'may be left out'}"
+            # Of one that may be missing the field says what that means.
+            about = f"{field['description']} " if "anyOf" in field else ""
+            within += [(each, name, its_title, about, each_kind) for each_kind, each in inner.items()]
             continue
         default = "required" if key in required else _default(field.get("default"))
-        own.append(f"| `{key}` | {default} | {_cell(field['description'])} |")
+        own.append(f"| `{key}` | {default} | {_cell(field['description'])}{_values(field)} |")
     if own:
-        title = ""
         if heading:
-            one_of = f' with `kind = "{kind}"`' if kind else ""
-            title = f"`{heading}`{one_of}: {_cell(model['description'])}\n\n"
+            one_of = f', with `kind = "{kind}"`' if kind else ""
+            title = f"{title}{one_of}: {_cell(model['description'])}\n\n"
         yield "\n".join([f"\n{title}| key | default | meaning |", "|---|---|---|", *own, ""])
-    for each, name, each_kind in within:
-        yield from _tables(each, definitions, name, each_kind)
+    for each, name, its_title, about, each_kind in within:
+        described = {**each, "description": about + each["description"]}
+        yield from _tables(described, definitions, name, its_title, each_kind)
 
 
 def _inner_models(
@@ -72,6 +79,25 @@ def _inner_models(
         if "$ref" in place:
             return {"": definitions[_name(place["$ref"])]}, name
     return {}, path
+
+
+def _values(field: dict[str, Any]) -> str:
+    """Return the words or the range that a key takes, as sentences; not a range that is wide or that its description states."""
+    one = field.get("anyOf", [field])[0]
+    found = ""
+    for place in (one, one.get("items", {})):
+        if "enum" in place:
+            found += f" One of {', '.join(f'`{_toml(each)}`' for each in place['enum'])}."
+        low, high = place.get("minimum"), place.get("maximum", _WIDE)
+        above, below = place.get("exclusiveMinimum"), place.get("exclusiveMaximum")
+        stated = re.search(r"\d to \d", field["description"])
+        if below is None and high < _WIDE and not stated:
+            lowest = f"Above {above:g}" if above is not None else f"{low:g}"
+            found += f" {lowest}{', at most' if above is not None else ' to'} {high:g}."
+    most = one.get("maxItems")
+    if most is not None and most != one.get("minItems"):
+        found += f" At most {most}."
+    return found
 
 
 def _name(reference: str) -> str:

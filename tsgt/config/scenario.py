@@ -171,7 +171,7 @@ class SimulatedStation(Model):
     prism_constant_mm: Annotated[float, Field(ge=-10_000, le=10_000)] = 10.0
     """Constant to add to the slope distance to reach the centre of the prism."""
     noise: NoiseConfig = NoiseConfig(range_sigma_ppm=0.0)
-    """Noise of one measurement."""
+    """Noise of one measurement; without this table `range_sigma_ppm` is 0."""
     instrument: InstrumentModelConfig = InstrumentModelConfig()
     """Behaviour of the instrument."""
 
@@ -191,7 +191,7 @@ class StatusFaultConfig(Model):
     station: Number
     """Number of the station."""
     status: Literal["tilt", "wrong_distance", "no_target", "angle_only"]
-    """Reported status: not levelled, wrong target, no prism, or too close for a distance."""
+    """Reported status: not levelled, wrong distance, no prism, or too close for a distance."""
     start_s: NotNegative
     """Start of the interval, from the start of the mission."""
     end_s: NotNegative

@@ -130,7 +130,7 @@ class SensorMountingFile(Model):
     position_m: Place
     """Origin of its axes in the axes of the reference point, [x, y, z]."""
     orientation_xyzw: Row4 = (0.0, 0.0, 0.0, 1.0)
-    """Unit quaternion [x, y, z, w] that rotates coordinates in its axes into those of the reference's point."""
+    """Unit quaternion [x, y, z, w] that rotates coordinates in its axes into those of the reference point."""
     position_sigma_mm: tuple[NotNegative, NotNegative, NotNegative] | None = None
     """One sigma of the position along each axis of the reference point; 0: exact. Without this key the position is unknown where it is fitted."""
     rotation_sigma_deg: tuple[NotNegative, NotNegative, NotNegative] | None = None

@@ -41,10 +41,11 @@ class PolarMeasurement(FiniteNumbers):
     prism: int
     """Number of the prism that it tracked, from 1."""
     sequence: int
-    """Sequence number of this station's measurements, from 0."""
+    """Sequence number of the station's measurements, from 0: with the protocol superframe that of its journal, which skips numbers
+    when the client is restarted; with classic the master's own count."""
     stamp_ns: int
-    """Time of the measurement on the master's Unix clock in ns, converted from the host stamp, with the station's
-    latency included."""
+    """Host stamp on the master's Unix clock in ns. The station's latency (``latency_s`` of ``setup``) is not subtracted: the
+    measurement was made that much earlier."""
     stamp_sigma_ns: int = 0
     """One sigma of ``stamp_ns`` in ns, without the instrument's latency. In a journal: of the conversion from the
     instrument's clock to the station's. In a recording: of that from the station's clock to the master's. In a merged

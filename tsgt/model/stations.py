@@ -105,8 +105,8 @@ class StationParameters(FiniteNumbers):
     vertical_index_rad: float = 0.0
     """Vertical index error in rad: the zenith angle (first face) that the instrument reads, less the true one."""
     collimation_rad: float = 0.0
-    """Horizontal collimation error in rad: the line of sight deviates by it clockwise; the horizontal angle reads that
-    over sin(zenith angle) too small."""
+    """Horizontal collimation error in rad: the line of sight deviates by it clockwise; the horizontal angle is
+    too small by that, divided by sin(zenith angle)."""
     noise: InstrumentNoise = TRACKING_NOISE
     """Noise of one measurement."""
     noise_scale: Vector3 = (1.0, 1.0, 1.0)

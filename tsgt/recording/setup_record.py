@@ -52,7 +52,7 @@ class SetupStation(FiniteNumbers):
     instrument: str | None = None
     """Kind of instrument; null where unknown: the radio does not carry it."""
     latency_s: float
-    """From a measurement to its stamp, in s, which is subtracted. Positive: the stamp is late."""
+    """From a measurement to its stamp, in s: subtract it from ``stamp_ns``. Positive: the stamp is late."""
     prism: int
     """Number of the prism that it tracks by configuration; what it tracks at the moment is in ``status``."""
     prism_constant_m: float
@@ -62,7 +62,7 @@ class SetupStation(FiniteNumbers):
     vertical_index_rad: float
     """Vertical index error, which is subtracted from its zenith angles, in rad."""
     collimation_rad: float
-    """Collimation error, which over sin(zenith angle) is added to its horizontal angles, in rad."""
+    """Collimation error in rad; divided by sin(zenith angle), it is added to its horizontal angles."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +117,7 @@ class SetupRecord(FiniteNumbers):
     lag_s: float | None
     """Lag of the final smoothed poses in s; null with the estimator linear, which has none."""
     smoothed_delays_s: tuple[float, ...]
-    """Delays in s at which smoothed poses are sent before; ``delay_s`` of the poses."""
+    """Delays in s at which smoothed poses are sent before the final ones: ``delay_s`` of these poses."""
     limits: ValidityLimits
     """As in ``hello``."""
     stations: tuple[SetupStation, ...]

@@ -147,7 +147,7 @@ class StationShare(FiniteNumbers):
     """The contribution of one station to a pose, or why there is none."""
 
     id: int
-    """Number of the station, from 1."""
+    """Number of the station, from 1; 0 while no station tracks the prism."""
     prism: int
     """Number of the prism that it tracks, from 1."""
     age_s: float | None
@@ -258,7 +258,7 @@ class StationStatus(FiniteNumbers):
     status: Status | None
     """The instrument's status of its last measurement; null before the first one."""
     prism: int | None = None
-    """Number of the prism that it is commanded to track; null when that is not known."""
+    """Number of the prism that it reports to track; null before its first report, and while it tracks none."""
     locked: bool | None = None
     """Whether it had a target at its last measurement; null before the first one."""
     answering: bool | None = None
@@ -275,9 +275,9 @@ class StationStatus(FiniteNumbers):
     """Signal-to-noise ratio of its last radio packet in dB; null before the first one."""
     clock_offset_ns: int | None = None
     """Offset of its clock from the master's now, in ns, positive when the station is ahead; null before the first
-    synchronisation."""
+    synchronisation, and with the protocol superframe, which has ``stamp_bound_ns``."""
     clock_bound_ns: int | None = None
-    """The offset is within this of the truth, in ns; null before the first synchronisation."""
+    """The offset is within this of the truth, in ns; null like the offset."""
     stamp_bound_ns: int | None = None
     """The time of its newest measurement is within this of the truth, in ns; null before the first one."""
     joined: bool | None = None
@@ -285,7 +285,8 @@ class StationStatus(FiniteNumbers):
     outstanding: int | None = None
     """Measurements that were made but have not been received yet; null with the protocol classic."""
     drain_rate_hz: float | None = None
-    """Decrease of ``outstanding`` per second over the last minute, negative while it grows; null before there are ten seconds."""
+    """Decrease of ``outstanding`` per second over the last minute, negative while it grows; null before there are ten seconds,
+    while it has not joined, and with the protocol classic."""
     drain_s: float | None = None
     """Time in s until none is outstanding, at that rate; null where it does not decrease."""
     missed_slots: int | None = None
@@ -473,7 +474,7 @@ class StatusRecord(FiniteNumbers):
     stamp_ns: int
     """Time of the record on the master's Unix clock in ns."""
     poses: int
-    """Poses, valid or not, since the master started."""
+    """Predicted or interpolated poses, valid or not, since the master started: one per epoch."""
     valid_poses: int
     """How many of them were valid."""
     stations: tuple[StationStatus, ...]
@@ -483,7 +484,7 @@ class StatusRecord(FiniteNumbers):
     authenticated: bool | None = None
     """Whether the radio is authenticated with a key; ``classic`` has none. Null without a radio."""
     frame_ms: float | None = None
-    """Mean duration of the last frames, from beacon to beacon, in ms; null with ``classic``."""
+    """Mean duration of the last frames, from beacon to beacon, in ms; null with ``classic``, and before the second beacon."""
     imu: ImuStatusOrNone = None
     """Status of the robot's IMU; absent where none is configured."""
     odometry: OdometryStatusOrNone = None

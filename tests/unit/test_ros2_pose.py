@@ -252,22 +252,28 @@ def test_station_levels_follow_the_conditions_of_all(publisher: Any) -> None:
         StationCondition.SILENT: ERROR,
         StationCondition.TRACKING: OK,
     }
-    for heard_s, after_s, answering, last, battery_percent in itertools.product(
+    cases = itertools.product(
         (None, 0.1, MAX_AGE_S - 0.1, MAX_AGE_S + 0.1, MAX_UNASKED_S - 1, MAX_UNASKED_S + 1),
         (None, 0.1, MAX_AGE_S - 0.1, MAX_AGE_S + 0.1),
         (None, True, False),
         (None, *MeasurementStatus),
         (None, LOW_BATTERY_PERCENT - 1, LOW_BATTERY_PERCENT),
-    ):
-        one = station(
-            1, last_heard_s=heard_s, age_s=None if after_s is None else (heard_s or 0.0) + after_s,
+    )
+    stations = [
+        station(
+            number, last_heard_s=heard_s, age_s=None if after_s is None else (heard_s or 0.0) + after_s,
             answering=answering, status=last, battery_percent=battery_percent,
-        )  # fmt: skip
-        node.take(status(one))
+        )
+        for number, (heard_s, after_s, answering, last, battery_percent) in enumerate(cases, 1)
+    ]  # fmt: skip
+    node.take(status(*stations))
+    diagnosis(node)
+    found = {each.name: each.level for each in node.published["/diagnostics"][-1].status}
+    for one in stations:
         expected = levels[station_condition(one)]
         if expected == OK and one.action_required:
             expected = WARN
-        assert diagnosis(node, "station 1")[0] == expected, one
+        assert found[f"tsgt: station {one.id}"] == expected, one
 
 
 def test_stations_are_stale_when_no_status_comes(publisher: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,7 +86,8 @@ def position_errors_m(found: SmoothedRecording) -> FloatArray:
 
 
 @pytest.mark.parametrize(
-    ("stations", "limit_mm"), [(3, 1.2), pytest.param(2, 2.0, marks=pytest.mark.slow), (1, 3.0)]
+    ("stations", "limit_mm"),
+    [pytest.param(3, 1.2, marks=pytest.mark.slow), pytest.param(2, 2.0, marks=pytest.mark.slow), (1, 3.0)],
 )
 def test_stations_and_an_imu_suffice(stations: int, limit_mm: float) -> None:
     """All poses are valid, and more exact than three stations give without an IMU."""
@@ -206,7 +207,9 @@ def test_poses_of_the_imu_are_those_of_its_frame() -> None:
     assert 1e3 * np.sqrt((error_m**2).mean()) < 2.0
 
 
-@pytest.mark.parametrize(("stations", "displaced"), [(3, False), (1, True)])
+@pytest.mark.parametrize(
+    ("stations", "displaced"), [pytest.param(3, False, marks=pytest.mark.slow), (1, True)]
+)
 def test_poses_of_one_station_allow_for_a_shock_before_them(stations: int, *, displaced: bool) -> None:
     """It may have turned the IMU, which a single prism does not tell."""
     recording = imu_recording(DRIVE, stations=stations)
@@ -221,7 +224,9 @@ def test_poses_of_one_station_allow_for_a_shock_before_them(stations: int, *, di
     assert (sigmas[after].min() > np.radians(0.5)) == displaced
 
 
-@pytest.mark.parametrize(("stations", "displaced"), [(3, False), (1, True)])
+@pytest.mark.parametrize(
+    ("stations", "displaced"), [pytest.param(3, False, marks=pytest.mark.slow), (1, True)]
+)
 def test_poses_of_one_station_allow_for_shocks_before_the_recording(
     stations: int, *, displaced: bool
 ) -> None:
@@ -236,6 +241,7 @@ def test_poses_of_one_station_allow_for_shocks_before_the_recording(
     assert more == pytest.approx(2 * displaced * np.radians(0.5) ** 2, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_poses_allow_for_each_shock() -> None:
     """Four knocks displace the IMU twice as far as one, on average; more are not allowed for."""
     recording = imu_recording(DRIVE, stations=1)
@@ -259,7 +265,7 @@ def test_measurements_that_are_seconds_apart_are_not_doubted() -> None:
     assert not found.imu.unused
 
 
-@pytest.mark.parametrize("stations", [3, 1])
+@pytest.mark.parametrize("stations", [pytest.param(3, marks=pytest.mark.slow), 1])
 def test_few_measurements_of_one_prism_between_outages_prove_nothing(stations: int) -> None:
     """They may be of a wrong prism: poses from the last measurement before on are invalid, those before are not."""
     recording = imu_recording(DRIVE, stations=stations)
@@ -323,7 +329,12 @@ def test_wrong_latency_of_the_imu_is_an_error_of_one_station() -> None:
 
 
 @pytest.mark.parametrize(
-    ("by_m", "moved"), [(0.0, False), (0.03, True), pytest.param(0.3, True, marks=pytest.mark.slow)]
+    ("by_m", "moved"),
+    [
+        pytest.param(0.0, False, marks=pytest.mark.slow),
+        (0.03, True),
+        pytest.param(0.3, True, marks=pytest.mark.slow),
+    ],
 )
 def test_poses_of_a_single_station_that_has_moved_are_invalid(by_m: float, *, moved: bool) -> None:
     """From just before the move on: the trajectory follows the station, and nothing tells where it is."""

@@ -175,7 +175,7 @@ def test_binary_file(tmp_path: Path) -> None:
         "x = " + 5000 * "{a=",
         "x = 0x" + 5000 * "f",
         "kind = 0x" + 5000 * "f",
-        "kind" + 20_000 * ".a" + " = 1",
+        "kind" + 3000 * ".a" + " = 1",
         'kind = "client"\nx' + 300 * ".a" + " = 1",
     ],
     ids=range(7),

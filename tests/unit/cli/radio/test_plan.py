@@ -52,7 +52,12 @@ def test_plan_as_text(tsgt: Tsgt) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "rows"), [((3, "--loss", 0.1), 1), ((16, "--loss", 0.9), 1 + 24), ((3, "--table"), 1 + 192)]
+    ("arguments", "rows"),
+    [
+        ((3, "--loss", 0.1), 1),
+        pytest.param((16, "--loss", 0.9), 1 + 24, marks=pytest.mark.slow),
+        pytest.param((3, "--table"), 1 + 192, marks=pytest.mark.slow),
+    ],
 )
 def test_other_settings_are_computed_where_they_are_needed(
     tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...], rows: int

@@ -647,7 +647,11 @@ def test_trajectory_that_was_never_consistent_contradicts_no_station(
 
 @pytest.mark.parametrize(
     ("health", "doubt", "disagrees"),
-    [(DISAGREES, DISAGREES, True), (SHOCK, SHOCK, False), (STUCK, "", False)],
+    [
+        (DISAGREES, DISAGREES, True),
+        pytest.param(SHOCK, SHOCK, False, marks=pytest.mark.slow),
+        pytest.param(STUCK, "", False, marks=pytest.mark.slow),
+    ],
 )
 def test_imu_that_disagreed_without_a_shock_degrades_the_poses_without_it(
     scene: Scene, health: str, doubt: str, *, disagrees: bool

@@ -49,6 +49,10 @@ class Case(NamedTuple):
     gap_s: tuple[float, float] = (0.0, 0.0)
     slows_s: tuple[float, float] = (0.0, 0.0)
     """Begin and end of a time in which responses become slower, four times in the end."""
+    before: float = 0.0
+    """Share of the delay that comes before the measurement."""
+    timed: bool = True
+    """Whether the durations of exchanges are known, as they are not behind a bridge."""
     no_fastest: bool = False
     """Whether the delay has no sharp lower end: then errors are against their own median."""
 
@@ -69,6 +73,11 @@ CASES = (
     Case("normally late, sigma 6 ms", delay_ms=lambda random: abs(random.normal(30, 6)), no_fastest=True),
     Case("nothing from 30 s to 90 s", gap_s=(30.0, 90.0)),
     Case("slower from 30 s to 150 s, in the end four times", slows_s=(30.0, 150.0)),
+    Case("the same, measured when it answers", slows_s=(30.0, 150.0), before=1.0),
+    Case("the same, measured half-way", slows_s=(30.0, 150.0), before=0.5),
+    Case("the same, without durations", slows_s=(30.0, 150.0), timed=False),
+    Case("0 to 40 ms late, measured half-way", before=0.5),
+    Case("0 to 40 ms late, without durations", timed=False),
 )
 
 
@@ -94,9 +103,10 @@ def errors(case: Case, seed: int) -> list[tuple[float, float, float]]:
         delay_ms = FASTEST_MS + case.delay_ms(random)
         if case.slows_s[0] <= true_s < case.slows_s[1]:
             delay_ms *= 4.0 ** ((true_s - case.slows_s[0]) / (case.slows_s[1] - case.slows_s[0]))
-        arrived_ns = round(1e9 * (1000 + true_s) + 1e6 * delay_ms)
+        late_ms = (1 - case.before) * (delay_ms - FASTEST_MS)
+        arrived_ns = round(1e9 * (1000 + true_s) + 1e6 * (FASTEST_MS + late_ms))
         if not is_distance:
-            clock.add(instrument_ms, arrived_ns, round(1e6 * delay_ms))
+            clock.add(instrument_ms, arrived_ns, round(1e6 * delay_ms) if case.timed else None)
             continue
         time = clock.timestamp(instrument_ms, arrived_ns + 40_000_000)
         if time is not None:

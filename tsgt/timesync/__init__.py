@@ -3,7 +3,8 @@
 In: timestamps of one-way messages, two-way exchanges, or an instrument's responses. Out: times on the other clock with
 sigma and bound. The station uses `beacon_clock` (the master's session time), `instrument_clock` (the instrument's over a serial line) and
 `exchange_clock` (over a network); the master uses `two_way` (a station's clock), `link_delay`, and `periodicity`.
-`clock_line` is the model of the clocks over the radio (`dual_rate` and `offset_regression` estimate it), `envelope` that of the others.
+`clock_line` is the model of the clocks over the radio (`dual_rate` and `offset_regression` estimate it). An instrument's clock is the line
+below delayed responses (`delay_envelope`, with the arithmetic in `envelope`), or without the delays that `duration_regression` explains.
 """
 
 from tsgt.timesync.beacon_clock import MAX_SAMPLES, BeaconClock

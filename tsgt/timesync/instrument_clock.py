@@ -1,8 +1,9 @@
-"""The instrument's own time on the host's clock, from the arrival of its responses.
+"""The instrument's own time on the host's clock, from exchanges with it.
 
 A response carries a time in ms since the instrument was switched on, and arrives after a delay that varies above a minimum.
 So "arrival less instrument time" lies above a line, the lower envelope: its height is the clock offset plus the minimum
-delay, its slope the skew. docs/explanation/instrument-time.md states errors and what is unobservable.
+delay, its slope the skew. Where the duration of each exchange explains its delay, the line is that of exchanges as fast as
+the fastest one. docs/explanation/instrument-time.md states errors and what is unobservable.
 """
 
 from __future__ import annotations
@@ -11,46 +12,26 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from statistics import median
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.timesync.envelope import MinimumDelay, fit_lower_envelope, minimum_delay
+from tsgt.timesync.delay_envelope import RESOLUTION_NS, DelayEnvelope, capped, few_samples, lowest_delay
+from tsgt.timesync.duration_regression import DurationRegression
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 MIN_SAMPLES = 8
 
 MAX_DELAY_NS = 2_000_000_000
 """A response further above the envelope than this is not late: a clock has jumped."""
 
-_WINDOW_NS = 300e9
-_BIN_NS = 2e9
-"""Of each bin the lowest sample is kept. A crystal in the sun changes its rate by 1e-6 in some minutes: over a longer
-window the envelope is no line."""
-
-_MIN_KEPT_SAMPLES = 30  # number of samples that are kept regardless of their age
-
 _STEADY_NS = 120e9  # a skew from a longer span than this is kept over a power cycle
 
-_MAX_SKEW = 300e-6
 _UNKNOWN_SKEW_SIGMA = 60e-6
 _KNOWN_SKEW_SIGMA = 5e-6
-_SKEW_WANDER = 1e-6
-"""Bound of the skew, its sigma before and after it was measured, and its wander within the window."""
-
-_RESOLUTION_NS = 1e6
-_ROUNDING_NS = 0.3e6
-"""Instruments state their time in whole ms. Whether they round or truncate is unknown, and cancels: what is added to a
-stated time is missing in the height of the envelope."""
+"""Sigma of the skew before and after it was measured."""
 
 _REFIT_GROWTH = 1.05  # refit without other news when the number of samples has grown by this factor
-
-_MIN_DELAY_SHARE = 0.01
-_DELAY_CAP = 4.0  # a delay counts as at most this many mean delays: a stall says nothing about the others
-
-_SLOW_SHARE = 0.75
-_SLOW_EXCHANGES = 4
-_MIN_TIMED = 20
-"""An exchange is slow if it takes longer than the fastest one, plus this share of what they take longer on average. After
-this many in succession the instrument has become slower. Then a sample bounds the envelope, but does not count in the fit:
-delays that grow would pass for a skew. The average is known from this many exchanges on."""
 
 _FASTER_TOLERANCE_NS = 5e6
 """A sample below the others is one of a faster response, and no corrupted one, if its exchange took less than theirs by as much,
@@ -70,9 +51,9 @@ class HostTime(NamedTuple):
     bound_ns: int
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Sample:
-    """The time of a response before initialisation."""
+    """The time of a response."""
 
     instrument_ms: int
     arrived_ns: int
@@ -84,24 +65,37 @@ class _Sample:
         return self.arrived_ns - self.instrument_ms * 1_000_000
 
 
-@dataclass(slots=True)
-class _Bin:
-    """Two seconds of samples: the lowest one, sums over those that count, and over the exchanges of known duration among them."""
+class _Durations:
+    """How long exchanges take, in ns: at least ``fastest``. An instrument that is switched off and on is as fast as before."""
 
-    number: int
-    x: float
-    y: float
-    count: int = 0  # of all
-    counted: int = 0
-    sum_x: float = 0.0
-    sum_y: float = 0.0
-    timed: int = 0
-    sum_took: float = 0.0
-    min_took: float = math.inf
+    def __init__(self, first: Sequence[int]) -> None:
+        """Expect durations as these."""
+        self.fastest = min(first)
+        self._mean_excess = median(first) - self.fastest
+        self._count = 0
+        self._sum = 0.0
+
+    def add(self, took_ns: int) -> None:
+        """Take the duration of an exchange."""
+        self.fastest = min(self.fastest, took_ns)
+        self._count += 1
+        self._sum += self.fastest + capped(took_ns - self.fastest, self._mean_excess)
+        self._mean_excess = self._sum / self._count - self.fastest
+
+    @property
+    def minimum(self) -> tuple[float, float]:
+        """The shortest possible duration and its sigma."""
+        lowest = lowest_delay(self._mean_excess, self._count, whole_ms=False)
+        return self.fastest - lowest.mean, few_samples(self._count) * lowest.sigma
+
+    @property
+    def excess(self) -> float:
+        """How far the fastest one is above it, as a multiple of which the bound is stated."""
+        return 2 * self._mean_excess / self._count
 
 
 class InstrumentClock:
-    """Fits the lower envelope of one instrument.
+    """Fits the clock of one instrument.
 
     A sample far from the envelope is inconsistent: it is used only when others agree with it. If these are too far off
     for any delay, the instrument was switched off and on or its count has jumped, and the fit is reset. ``resets``: how
@@ -113,6 +107,7 @@ class InstrumentClock:
         self._whole_ms = True
         self._known_skew = 0.0  # host against instrument; survives a power cycle
         self._known_sigma = _UNKNOWN_SKEW_SIGMA
+        self._durations: _Durations | None = None  # survives it too
         self._seen = 0
         self.resets = 0
         self.inconsistent = False
@@ -120,31 +115,27 @@ class InstrumentClock:
 
     def _reset(self, samples: list[_Sample]) -> None:
         self._initial = samples
-        self._bins: deque[_Bin] = deque()
+        self._responses = DelayEnvelope(self._known_skew, [0.0])
+        self._regression = DurationRegression()
         self._x0 = self._y0 = 0
-        self._height = self._skew = self._lift = 0.0
-        self._mean_delay = self._excess = self._sigma = 0.0
-        self._skew_sigma = self._known_sigma
-        self._newest = self._pivot = 0.0
-        self._samples = self._counted = self._fitted = 0
-        self._slow = 0  # how many of the last exchanges were slow
-        self._candidates: deque[tuple[int, int, int]] = deque(maxlen=_CANDIDATES)
+        self._newest = 0.0
+        self._fitted = 0
+        self._candidates: deque[tuple[int, _Sample]] = deque(maxlen=_CANDIDATES)
 
     @property
     def initialised(self) -> bool:
         """Whether there were enough samples for times."""
-        return self._samples > 0
+        return self._fitted > 0
 
     @property
     def samples(self) -> int:
         """How many samples the envelope rests on."""
-        return self._samples
+        return self._responses.samples
 
     @property
     def sigma_ns(self) -> float:
         """One sigma of the newest times; infinite before initialisation."""
-        drift = self._skew_sigma * abs(self._newest - self._pivot)
-        return math.hypot(self._sigma, drift) if self.initialised else math.inf
+        return self._sigma_at(self._newest) if self.initialised else math.inf
 
     def use_fractional_milliseconds(self) -> None:
         """Take times as finer than whole ms; the caller subtracts the fraction from each arrival and adds it to each result."""
@@ -160,18 +151,16 @@ class InstrumentClock:
         """
         self._seen += 1
         self.inconsistent = False
+        sample = _Sample(instrument_ms, arrived_ns, took_ns)
         if not self.initialised:
-            self._initial.append(_Sample(instrument_ms, arrived_ns, took_ns))
+            self._initial.append(sample)
             if len(self._initial) >= MIN_SAMPLES:
                 self._initialise()
             return True
         x, y = self._coordinates(instrument_ms, arrived_ns)
-        delay = y - self._height - self._skew * x
-        if not -self._gate(x) - self._faster_by(took_ns) <= delay <= MAX_DELAY_NS:
-            return self._add_inconsistent(instrument_ms, arrived_ns)
-        new_bin = self._put(x, y, took_ns)
-        below = y < self._height + self._skew * x
-        if new_bin or below or self._samples > _REFIT_GROWTH * self._fitted:
+        if not -self._gate(x) - self._faster_by(took_ns) <= y - self._lowest_at(x) <= MAX_DELAY_NS:
+            return self._add_inconsistent(sample)
+        if self._put(sample) or self.samples > _REFIT_GROWTH * self._fitted:
             self._fit()
         return True
 
@@ -180,10 +169,16 @@ class InstrumentClock:
         if not self.initialised:
             return None
         x = float(instrument_ms * 1_000_000 - self._x0)
-        drift = self._skew_sigma * abs(x - self._pivot)
-        host_ns = self._x0 + self._y0 + round(x + self._height + self._lift + self._skew * x)
-        sigma_ns = math.hypot(self._sigma, drift)
-        return HostTime(host_ns, round(sigma_ns), round(_RESOLUTION_NS + 8 * self._excess + 3 * drift))
+        # A time in whole ms is truncated: the distance was taken half of one later on average. Whether an instrument rounds
+        # instead is unknown, and cancels: what is added to the height of the envelope is missing in it; offsets without delays
+        # are later by that on average.
+        if self._regression.explains and self._durations is not None:
+            offset = self._regression.at(x, self._durations.minimum[0])
+        else:
+            offset = self._responses.at(x) + (0.5 * RESOLUTION_NS if self._whole_ms else 0.0)
+        host_ns = self._x0 + self._y0 + round(x + offset)
+        bound = RESOLUTION_NS + 8 * self._excess + 3 * self._drift(x)
+        return HostTime(host_ns, round(self._sigma_at(x)), round(bound))
 
     def timestamp(self, instrument_ms: int, arrived_ns: int) -> HostTime | None:
         """Return the time of a distance, from its instrument time and the arrival of the first byte of its response.
@@ -194,7 +189,7 @@ class InstrumentClock:
         if self.initialised:
             x, y = self._coordinates(instrument_ms, arrived_ns)
             self.inconsistent = False
-            if not 0 <= y - self._height - self._skew * x <= MAX_DELAY_NS:
+            if not 0 <= y - self._lowest_at(x) <= MAX_DELAY_NS:
                 self.add(instrument_ms, arrived_ns)
         else:
             self.add(instrument_ms, arrived_ns)
@@ -224,88 +219,53 @@ class InstrumentClock:
         kept.sort(key=lambda each: each.instrument_ms)
         self._x0 = kept[0].instrument_ms * 1_000_000
         self._y0 = kept[0].arrived_ns - self._x0
-        self._skew = self._known_skew
-        points = [self._coordinates(each.instrument_ms, each.arrived_ns) for each in kept]
-        heights = [y for _, y in points]
-        self._height = min(heights)
-        self._mean_delay = median(heights) - self._height
-        for (x, y), each in zip(points, kept, strict=True):
-            self._put(x, y, each.took_ns)
+        offsets = [self._coordinates(each.instrument_ms, each.arrived_ns)[1] for each in kept]
+        self._responses = DelayEnvelope(self._known_skew, offsets)
+        durations = [each.took_ns for each in kept if each.took_ns is not None]
+        if durations and self._durations is None:
+            self._durations = _Durations(durations)
+        for each in kept:
+            self._put(each)
         self._initial = []
         self._fit()
 
     def _gate(self, x: float) -> float:
         """Return how far below the envelope a sample may lie and still be a faster response, in ns."""
-        return _RESOLUTION_NS + 10 * self._excess + 3 * self._skew_sigma * abs(x - self._pivot)
+        return RESOLUTION_NS + 10 * self._excess + 3 * self._drift(x)
 
     def _faster_by(self, took_ns: int | None) -> float:
         """Return by how much an exchange was faster than all before, in ns; 0 where unknown."""
-        fastest = self._fastest_exchange()
-        return 0.0 if took_ns is None or math.isinf(fastest) else max(fastest - took_ns, 0.0)
+        if took_ns is None or self._durations is None:
+            return 0.0
+        return max(self._durations.fastest - took_ns, 0.0)
 
-    def _fastest_exchange(self) -> float:
-        """Return how long the fastest exchange of the window took, in ns; infinite if none is known."""
-        return min([bin_.min_took for bin_ in self._bins], default=math.inf)
-
-    def _put(self, x: float, y: float, took_ns: int | None = None) -> bool:
-        """Put a sample into its bin; return whether it starts a new one."""
-        bins = self._bins
-        number = math.floor(x / _BIN_NS)
-        new = not bins or number > bins[-1].number
-        if new:
-            bins.append(_Bin(number, x, y))
-            oldest = number - _WINDOW_NS / _BIN_NS
-            while bins[0].number < oldest and self._samples - bins[0].count >= _MIN_KEPT_SAMPLES:
-                self._samples -= bins[0].count
-                self._counted -= bins.popleft().counted
-        bin_ = next((bin_ for bin_ in reversed(bins) if bin_.number <= number), bins[0])
-        if y - self._skew * x < bin_.y - self._skew * bin_.x:
-            bin_.x, bin_.y = x, y
-        bin_.count += 1
-        self._samples += 1
+    def _put(self, sample: _Sample) -> bool:
+        """Take a sample; return whether it asks for a new fit."""
+        x, y = self._coordinates(sample.instrument_ms, sample.arrived_ns)
         self._newest = max(self._newest, x)
-        self._slow = self._slow + 1 if took_ns is not None and self._is_slow(took_ns) else 0
-        if self._slow >= _SLOW_EXCHANGES:
-            return new
-        self._counted += 1
-        bin_.counted += 1
-        bin_.sum_x += x
-        bin_.sum_y += min(
-            y, self._height + self._skew * x + _DELAY_CAP * max(self._mean_delay, _RESOLUTION_NS)
-        )
-        if took_ns is not None:
-            bin_.timed += 1
-            bin_.sum_took += took_ns
-            bin_.min_took = min(bin_.min_took, took_ns)
-        return new
+        if sample.took_ns is not None and self._durations is not None:
+            self._durations.add(sample.took_ns)
+            self._regression.put(x, y, float(sample.took_ns))
+        return self._responses.put(x, y)
 
-    def _is_slow(self, took_ns: int) -> bool:
-        """Whether an exchange took longer than usual."""
-        timed = sum([bin_.timed for bin_ in self._bins])
-        if timed < _MIN_TIMED:
-            return False
-        mean = sum([bin_.sum_took for bin_ in self._bins]) / timed
-        fastest = self._fastest_exchange()
-        return took_ns > fastest + _SLOW_SHARE * (mean - fastest)
-
-    def _add_inconsistent(self, instrument_ms: int, arrived_ns: int) -> bool:
+    def _add_inconsistent(self, sample: _Sample) -> bool:
         """Hold a sample until enough others agree with it; return False if they reset the fit."""
         self.inconsistent = True
-        self._candidates.append((self._seen, instrument_ms, arrived_ns))
-        offsets = [arrived - ms * 1_000_000 for _, ms, arrived in self._candidates]
+        self._candidates.append((self._seen, sample))
+        agreeing = [each for _, each in self._candidates]
+        offsets = [each.offset_ns for each in agreeing]
         recent = self._candidates[-1][0] - self._candidates[0][0] <= _CANDIDATE_WINDOW
         if len(offsets) < _CANDIDATES or not recent or max(offsets) - min(offsets) > _CANDIDATE_SPREAD_NS:
             return True
-        agreeing = [_Sample(ms, arrived, None) for _, ms, arrived in self._candidates]
         points = [self._coordinates(each.instrument_ms, each.arrived_ns) for each in agreeing]
         self.inconsistent = False
-        if all(abs(y - self._height - self._skew * x) <= MAX_DELAY_NS / 2 for x, y in points):
+        if all(abs(y - self._lowest_at(x)) <= MAX_DELAY_NS / 2 for x, y in points):
             # The minimum delay or the skew has changed: the old envelope is void, the origin stays.
             self._candidates.clear()
-            self._bins.clear()
-            self._samples = self._counted = 0
-            for x, y in points:
-                self._put(x, y)
+            self._responses.clear()
+            self._regression.clear()
+            for each in agreeing:
+                self._put(each)
             self._fit()
             return True
         self._reset(agreeing)
@@ -314,42 +274,38 @@ class InstrumentClock:
 
     # --- The fit ----------------------------------------------------------------------------------------------
 
+    @property
+    def _excess(self) -> float:
+        """How far the lowest sample lies above the line, as a multiple of which bounds are stated, in ns."""
+        if self._regression.explains and self._durations is not None:
+            return self._durations.excess + self._regression.scatter / math.sqrt(self.samples)
+        return self._responses.excess
+
+    def _drift(self, x: float) -> float:
+        """Return one sigma of the line by the skew alone, in ns."""
+        return self._regression.drift(x) if self._regression.explains else self._responses.drift(x)
+
+    def _lowest_at(self, x: float) -> float:
+        """Return the least arrival less instrument time of exchanges as fast as the fastest one so far."""
+        if self._regression.explains and self._durations is not None:
+            return self._regression.at(x, self._durations.fastest) - RESOLUTION_NS
+        return self._responses.lowest_at(x)
+
+    def _sigma_at(self, x: float) -> float:
+        """Return one sigma of times on the host's clock, in ns."""
+        if self._regression.explains and self._durations is not None:
+            return self._regression.sigma_at(x, *self._durations.minimum)
+        return self._responses.sigma_at(x)
+
     def _fit(self) -> None:
-        """Fit the envelope to all samples."""
-        bins = self._bins
-        mean_x = sum(bin_.sum_x for bin_ in bins) / self._counted
-        mean_y = sum(bin_.sum_y for bin_ in bins) / self._counted
-        envelope = min(bin_.y - self._skew * (bin_.x - mean_x) for bin_ in bins)
-        mean_delay = mean_y - envelope
-        self._mean_delay = (
-            mean_delay if self._counted >= _MIN_KEPT_SAMPLES else max(mean_delay, self._mean_delay)
-        )
-        share = max(2 * mean_delay / max(self._counted - 1, 1) / _RESOLUTION_NS, _MIN_DELAY_SHARE)
-        # Without truncation the minimum delay is exponentially distributed: mean and sigma are the same.
-        lowest = minimum_delay(share) if self._whole_ms else MinimumDelay(share, share)
-        line = fit_lower_envelope(
-            [(bin_.x, bin_.y) for bin_ in bins],
-            centre=mean_x,
-            scale=lowest.sigma * _RESOLUTION_NS,
-            prior=(self._known_skew, self._known_sigma),
-            max_slope=_MAX_SKEW,
-        )
-        self._skew = line.slope
-        self._skew_sigma = line.slope_sigma + _SKEW_WANDER
-        counted_x = [bin_.x for bin_ in bins if bin_.counted]
-        if counted_x[-1] - counted_x[0] > _STEADY_NS:
-            self._known_skew, self._known_sigma = self._skew, _KNOWN_SKEW_SIGMA
-        self._height = min(bin_.y - self._skew * bin_.x for bin_ in bins)
-        # A time in whole ms is truncated: the distance was taken half of one later on average.
-        truncation = 0.5 if self._whole_ms else 0.0
-        self._lift = line.height - self._height + (truncation - lowest.mean) * _RESOLUTION_NS
-        self._excess = 2 * self._mean_delay / self._counted
-        rounding_ns = _ROUNDING_NS if self._whole_ms else 0.0
-        # The spread is known from as many responses only: as with Student's distribution, less one for the lowest.
-        few = max(self._counted - 1, 1) / max(self._counted - 3, 1)
-        self._sigma = math.hypot(rounding_ns, few * lowest.sigma * _RESOLUTION_NS, line.pivot_sigma)
-        self._pivot = line.pivot
-        self._fitted = self._samples
+        """Fit the line to all samples."""
+        known = (self._known_skew, self._known_sigma)
+        self._responses.fit(known, whole_ms=self._whole_ms)
+        self._regression.fit(known)
+        steady = self._regression if self._regression.explains else self._responses
+        if steady.span_ns > _STEADY_NS:
+            self._known_skew, self._known_sigma = steady.skew, _KNOWN_SKEW_SIGMA
+        self._fitted = self.samples
 
 
 def _is_corrupted(lowest: _Sample, second: _Sample, middle_ns: float) -> bool:

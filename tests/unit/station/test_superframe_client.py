@@ -105,7 +105,7 @@ async def test_killed_client_loses_no_measurement(tmp_path: Path) -> None:
     async with superframe_day(tmp_path) as (day, air):
         air.master.session_interval = 1
         for run in range(25):
-            await air.frames(2.5)
+            await air.frames(4.0)
             await day.kill()
             day.start()
             for _ in range(7 * run):

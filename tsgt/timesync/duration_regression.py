@@ -2,7 +2,7 @@
 
 What an exchange takes longer than the fastest one passes before the instrument takes its time, or after it, or both in a fixed
 proportion. Where that holds, each exchange tells how late its response is: without that delay, offsets follow a line, however slow
-exchanges become. All times are in ns.
+exchanges become. All times are in ns. A client loads no numpy.
 """
 
 from __future__ import annotations
@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from typing import Final
-
-import numpy as np
 
 _WINDOW_NS: Final = 300e9  # crystals change their rate; over a longer window offsets follow no line
 _MIN_SAMPLES: Final = 8
@@ -35,9 +33,9 @@ class DurationRegression:
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, float, float]] = deque()
-        self._mean = np.zeros(3)
+        self._mean = (0.0, 0.0, 0.0)
         self._share = self.skew = 0.0
-        self._covariance = np.zeros((3, 3))
+        self._skew_variance = self._share_variance = self._covariance = 0.0
         self.scatter = math.inf
 
     @property
@@ -67,37 +65,44 @@ class DurationRegression:
         if count < _MIN_SAMPLES:
             self.scatter = math.inf
             return
-        samples = np.array(self._samples)
-        self._mean = samples.mean(axis=0)
-        x, y, took = (samples - self._mean).T
+        mean_x, mean_y, mean_took = self._mean = (
+            sum([x for x, _, _ in self._samples]) / count,
+            sum([y for _, y, _ in self._samples]) / count,
+            sum([took for _, _, took in self._samples]) / count,
+        )
+        centred = [(x - mean_x, y - mean_y, took - mean_took) for x, y, took in self._samples]
         skew, skew_sigma = known_skew
-        weights = _MIN_SCATTER_NS / np.array([skew_sigma, _SHARE_SIGMA])
-        prior = np.array([[weights[0], 0.0], [0.0, weights[1]]])
-        design = np.concatenate([np.stack([x, took], axis=1), prior])
-        offsets = np.concatenate([y, weights * (skew, _SHARE)])
-        normal = design.T @ design
-        self.skew, self._share = np.linalg.solve(normal, design.T @ offsets).tolist()
-        residuals = y - self.skew * x - self._share * took
-        scatter = math.sqrt(float(residuals @ residuals) / (count - _PARAMETERS))
-        self.scatter = max(scatter, _MIN_SCATTER_NS)
-        self._covariance[0, 0] = self.scatter**2 / count
-        self._covariance[1:, 1:] = self.scatter**2 * np.linalg.inv(normal)
-        self._covariance[1, 1] += _SKEW_WANDER**2
+        skew_weight, share_weight = (_MIN_SCATTER_NS / skew_sigma) ** 2, (_MIN_SCATTER_NS / _SHARE_SIGMA) ** 2
+        xx = sum([x * x for x, _, _ in centred]) + skew_weight
+        tt = sum([took * took for _, _, took in centred]) + share_weight
+        xt = sum([x * took for x, _, took in centred])
+        xy = sum([x * y for x, y, _ in centred]) + skew_weight * skew
+        ty = sum([took * y for _, y, took in centred]) + share_weight * _SHARE
+        determinant = xx * tt - xt * xt
+        self.skew, self._share = (tt * xy - xt * ty) / determinant, (xx * ty - xt * xy) / determinant
+        squares = sum([(y - self.skew * x - self._share * took) ** 2 for x, y, took in centred])
+        self.scatter = max(math.sqrt(squares / (count - _PARAMETERS)), _MIN_SCATTER_NS)
+        variance = self.scatter**2 / determinant
+        self._skew_variance = variance * tt + _SKEW_WANDER**2
+        self._share_variance, self._covariance = variance * xx, -variance * xt
 
     def at(self, x: float, took: float) -> float:
         """Return the offset at a time for an exchange of this duration."""
-        mean_x, mean_y, mean_took = self._mean.tolist()
-        return float(mean_y + self.skew * (x - mean_x) + self._share * (took - mean_took))
+        mean_x, mean_y, mean_took = self._mean
+        return mean_y + self.skew * (x - mean_x) + self._share * (took - mean_took)
 
     def sigma_at(self, x: float, took: float, took_sigma: float) -> float:
         """Return one sigma of that offset, and of the duration.
 
         The scatter does not average out: what durations do not explain may delay all responses alike.
         """
-        row = np.array([1.0, x - self._mean[0], took - self._mean[2]])
-        variance = float(row @ self._covariance @ row) + self.scatter**2
-        return math.sqrt(variance + (self._share * took_sigma) ** 2)
+        x, took = x - self._mean[0], took - self._mean[2]
+        line = (
+            x * x * self._skew_variance + took * took * self._share_variance + 2 * x * took * self._covariance
+        )
+        scatter = self.scatter**2 * (1 + 1 / max(len(self._samples), 1))
+        return math.sqrt(line + scatter + (self._share * took_sigma) ** 2)
 
     def drift(self, x: float) -> float:
         """Return one sigma of the offset by the skew alone."""
-        return math.sqrt(float(self._covariance[1, 1])) * abs(x - float(self._mean[0]))
+        return math.sqrt(self._skew_variance) * abs(x - self._mean[0])

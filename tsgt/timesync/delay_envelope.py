@@ -23,7 +23,7 @@ window the envelope is no line."""
 
 _MIN_KEPT_SAMPLES: Final = 30  # number of samples that are kept regardless of their age
 
-MAX_SKEW: Final = 300e-6
+_MAX_SKEW: Final = 300e-6
 _SKEW_WANDER: Final = 1e-6
 """Bound of the skew, and its wander within the window."""
 
@@ -32,9 +32,8 @@ _ROUNDING_NS: Final = 0.3e6
 """Instruments state their time in whole ms."""
 
 _MIN_DELAY_SHARE: Final = 0.01
-_DELAY_CAP: Final = (
-    4.0  # a delay counts as at most this many mean delays: a stall says nothing about the others
-)
+_DELAY_CAP: Final = 4.0
+"""A delay counts as at most this many mean delays: a stall says nothing about the others."""
 
 
 def lowest_delay(mean_delay_ns: float, samples: int, *, whole_ms: bool) -> MinimumDelay:
@@ -151,7 +150,7 @@ class DelayEnvelope:
             centre=mean_x,
             scale=lowest.sigma,
             prior=known_skew,
-            max_slope=MAX_SKEW,
+            max_slope=_MAX_SKEW,
         )
         self.skew, self._skew_sigma = line.slope, line.slope_sigma + _SKEW_WANDER
         self._lowest = min([bin_.y - self.skew * bin_.x for bin_ in bins])

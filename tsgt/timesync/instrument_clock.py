@@ -169,9 +169,8 @@ class InstrumentClock:
         if not self.initialised:
             return None
         x = float(instrument_ms * 1_000_000 - self._x0)
-        # A time in whole ms is truncated: the distance was taken half of one later on average. Whether an instrument rounds
-        # instead is unknown, and cancels: what is added to the height of the envelope is missing in it; offsets without delays
-        # are later by that on average.
+        # A time in whole ms is truncated: the distance was taken half of one later on average. The mean offset of the
+        # regression contains that half, the height of the envelope does not. Rounding instead gives the same times.
         if self._regression.explains and self._durations is not None:
             offset = self._regression.at(x, self._durations.minimum[0])
         else:

@@ -48,8 +48,8 @@ CONTRADICTION_S, SETUP_CHECK_S = 5.0, 50.0
 """Measurements of these times before the events ``station_contradicted`` and ``imu_setup_wrong`` are looked at for their cause."""
 
 MIN_LATE_S = 0.004
-"""Stamps of a station that are later may contradict the IMU: so much is named as a wrong latency. A client takes an instrument that slows
-down gradually for one whose clock is slow (docs/explanation/instrument-time.md).
+"""Stamps of a station that are later may contradict the IMU: so much is named as a wrong latency. A client that starts while its
+instrument is slow takes slow responses for usual ones (docs/explanation/instrument-time.md).
 """
 
 

@@ -131,7 +131,7 @@ def _end(demo: Demo) -> dict[str, object]:
 def test_demo_streams_records_and_summarises(start: Start, folder: Path, protocol: str) -> None:
     """A reader gets live poses; the result has errors and the recording."""
     output = folder / "kept.jsonl"
-    demo = start("--protocol", protocol, "--duration", "12", "--output", str(output))
+    demo = start("--protocol", protocol, "--duration", "16", "--output", str(output))
     with demo.connect(folder / "poses.sock") as connection:
         lines = [json.loads(line) for line in connection.makefile()]
     result = _end(demo)

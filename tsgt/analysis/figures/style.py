@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from tsgt.errors import MissingExtraError, OutputFileError
+from tsgt.recording import write_atomically
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -87,10 +88,8 @@ def save(figure: Figure, path: Path) -> None:
         # All formats have the same layout, and computing it takes as long as drawing: compute it once.
         layout.execute(figure)
         figure.set_layout_engine(None)
-    try:
-        figure.savefig(path, metadata=metadata)
-    except OSError as error:
-        raise OutputFileError(error.strerror or str(error), path=path) from error
+    with write_atomically(path) as file:
+        figure.savefig(file, format=path.suffix[1:], metadata=metadata)
 
 
 def png_bytes(figure: Figure) -> bytes:

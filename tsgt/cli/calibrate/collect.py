@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from typing import TYPE_CHECKING
 
 import click
@@ -73,8 +74,11 @@ def collect(
     if missing:
         click.echo(f"{output}: {missing} measurements are missing; the same command continues", err=True)
     else:
+        sudo = (
+            "sudo " if os.geteuid() == 0 else ""
+        )  # as this command was started: the configuration is root's
         click.echo(
-            f"{output}: complete. Next: tsgt calibrate targets {output} --apply {config_path}", err=True
+            f"{output}: complete. Next: {sudo}tsgt calibrate targets {output} --apply {config_path}", err=True
         )
 
 

@@ -21,6 +21,8 @@ EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)  # A clock with an earlier time has 
 GOOD_CLOCK_SOURCES = {"arch_sys_counter", "tsc", "timer", "kvm-clock", "stc"}
 """Clock sources of Raspberry Pis (`arch_sys_counter`; `timer` and `stc` on the oldest), PCs and virtual machines with fine resolution and fast access."""
 
+_HIDDEN = (Path("/home"), Path("/root"), Path("/run/user"))  # from a unit with ProtectHome=yes (systemd.exec)
+
 _PROPERTIES = (
     "LoadState,UnitFileState,ActiveState,SubState,User,SupplementaryGroups,ExecStart,"
     "ProtectSystem,ProtectHome,StateDirectory,ReadWritePaths,"
@@ -40,6 +42,13 @@ def service_of(machine: Machine, kind: Kind) -> dict[str, str] | None:
 def is_installed(service: Mapping[str, str] | None) -> bool:
     """Whether the unit exists."""
     return service is not None and service.get("LoadState") == "loaded"
+
+
+def hides(service: Mapping[str, str] | None, path: Path) -> bool:
+    """Whether the sandbox of the unit hides a file or folder from it; ReadWritePaths does not bring it back."""
+    if service is None or not is_installed(service) or service.get("ProtectHome") != "yes":
+        return False
+    return any(path.absolute().is_relative_to(folder) for folder in _HIDDEN)
 
 
 def may_write(service: Mapping[str, str] | None, folder: Path) -> bool:

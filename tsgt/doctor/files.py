@@ -23,7 +23,7 @@ from tsgt.config import (
     missing_setup_files,
     parameters,
 )
-from tsgt.doctor.computer import EARLIEST, is_installed, may_write
+from tsgt.doctor.computer import EARLIEST, hides, is_installed, may_write
 from tsgt.doctor.finding import failed, note, ok, skipped
 from tsgt.errors import ConfigError, GeometryError
 from tsgt.radio.from_config import lora_settings
@@ -232,6 +232,15 @@ def check_disk(
     """
     folder = (config.journal if isinstance(config, ClientConfig) else config.recording).directory
     existing = _existing_parent(folder)
+    if hides(service, folder):
+        return [
+            failed(
+                "disk",
+                f"the sandbox of the service hides {folder}: configure a folder outside of /home, /root and /run/user, "
+                "as /var/lib/tsgt",
+            ),
+            skipped("disk_write", "the service may not write to it"),
+        ]
     if not may_write(service, folder):
         return [
             failed(

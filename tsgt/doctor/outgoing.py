@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from tsgt.doctor.computer import is_installed
+from tsgt.doctor.computer import hides, is_installed
 from tsgt.doctor.finding import failed, note, ok
 
 if TYPE_CHECKING:
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from tsgt.doctor.finding import Finding
     from tsgt.doctor.machine import Machine
 
-_HIDDEN = (Path("/home"), Path("/root"), Path("/run/user"))  # from a unit with ProtectHome=yes
 _CLIENT_DROP_IN = "/etc/systemd/system/tsgt-client.service.d/network-instrument.conf"
 _BUNDLE = "(in a clone, or in /usr/share/doc/tsgt)"
 _DROP_IN = (
@@ -71,8 +70,7 @@ def _why_not_started(machine: Machine, command: Sequence[str], service: Mapping[
     found = machine.which(program)
     if found is None:
         return f"the program {program} does not exist or is not executable"
-    hides_home = service is not None and is_installed(service) and service.get("ProtectHome") == "yes"
-    if hides_home and any(Path(found).is_relative_to(folder) for folder in _HIDDEN):
+    if hides(service, Path(found)):
         return f"the sandbox of the service hides {found}: put it under /usr/local/bin"
     return ""
 
@@ -104,6 +102,7 @@ def _denied_network(service: Mapping[str, str]) -> str:
         return f"RestrictAddressFamilies={' '.join(families)}"
     everything = {"any", "0.0.0.0/0", "::/0"}
     denied = everything & set(service.get("IPAddressDeny", "").split())
-    if denied and not service.get("IPAddressAllow", "").split():
+    local = {"localhost", "127.0.0.0/8", "::1/128"}
+    if denied and not set(service.get("IPAddressAllow", "").split()) - local:
         return "IPAddressDeny=any"
     return ""

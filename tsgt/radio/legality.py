@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.config import (
@@ -16,13 +17,16 @@ from tsgt.radio.from_config import lora_settings, planned_cycle
 from tsgt.radio.planning import ChannelUse, TrafficLoad, chip_violation, compliant_use, violations
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from tsgt.config import ClientConfig, MasterProtocolConfig
     from tsgt.radio.base import LoRaSettings
 
 RATE_HZ = 2.5
-"""Measurement rate of an instrument; the duty cycles follow from it."""
+"""Measurement rate of an instrument, which no configuration states; the duty cycles follow from it."""
+FASTER_HZ = (5.0, 10.0, 20.0)
+"""Rates of other instruments, whose longer replies may violate a limit that is kept at :data:`RATE_HZ`."""
 
 
 class Legality(NamedTuple):
@@ -31,7 +35,7 @@ class Legality(NamedTuple):
     Attributes
     ----------
     use
-        Of the master with its stations; of a client, whose master decides their number, with as many stations as there
+        At :data:`RATE_HZ`, of the master with its stations; of a client, whose master decides their number, with as many stations as there
         may be: a station of fewer transmits more.
     stations
         Number of stations for which that is.
@@ -40,7 +44,7 @@ class Legality(NamedTuple):
     remedy
         One line that complies, as keys of ``[radio]``; None: nothing is violated.
     warning
-        What the chip does not tolerate, whatever the law says.
+        What the chip does not tolerate, whatever the law says; or what faster instruments would violate.
     """
 
     use: ChannelUse
@@ -59,18 +63,28 @@ def legality(config: ClientConfig | MasterConfig, path: Path) -> Legality:
         else MAX_STATION_NUMBERS[config.protocol.kind]
     )
 
-    def plan(settings: LoRaSettings) -> ChannelUse:
-        cycle = planned_cycle(_protocol(config), TrafficLoad(stations=stations, rate_hz=RATE_HZ), settings)
+    def plan(settings: LoRaSettings, rate_hz: float = RATE_HZ) -> ChannelUse:
+        cycle = planned_cycle(_protocol(config), TrafficLoad(stations=stations, rate_hz=rate_hz), settings)
         return ChannelUse(settings, radio.antenna_gain_dbi, cycle.master_duty, cycle.station_duty)
 
     use = plan(lora_settings(radio, path))
     found: list[str] = []
     remedy = None
+    warning = chip_violation(use)
     if radio.region is not None and radio.licence is None:
         found = violations(use, radio.region)
         if found:
             remedy = remedy_text(use, compliant_use(use, radio.region, plan))
-    return Legality(use, stations, tuple(found), remedy, chip_violation(use))
+        elif warning is None:
+            warning = _faster_violation(partial(plan, use.settings), radio.region)
+    return Legality(use, stations, tuple(found), remedy, warning)
+
+
+def _faster_violation(plan: Callable[[float], ChannelUse], region: str) -> str | None:
+    for rate_hz in FASTER_HZ:
+        if found := violations(plan(rate_hz), region):
+            return f"With instruments that measure at {rate_hz:g} Hz it would violate {'; '.join(found)}"
+    return None
 
 
 def check_legality(config: ClientConfig | MasterConfig, path: Path) -> None:

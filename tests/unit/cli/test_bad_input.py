@@ -88,6 +88,23 @@ def test_tracks_may_be_given_one_by_one(tsgt: Tsgt, files: dict[str, Path]) -> N
     assert tsgt("import", "rts", *tracks, *others, "--json").json()["measurements"] == 75
 
 
+@pytest.mark.parametrize("option", ["--target-constant-mm", "--prism-constant-mm"])
+def test_constants_of_raw_measurements_need_targets(tsgt: Tsgt, files: dict[str, Path], option: str) -> None:
+    """Without targets there are no distances to correct, and nobody shall believe that they were."""
+    outcome = tsgt(*import_arguments(files), option, 10)
+    assert outcome.code == 2
+    assert option in outcome.err
+    assert not files["recording"].exists()
+
+
+def test_cut_track_is_imported_with_a_note(tsgt: Tsgt, files: dict[str, Path]) -> None:
+    """Its last coordinate may lack digits."""
+    files["track2"].write_bytes(files["track2"].read_bytes().rstrip())
+    outcome = tsgt(*import_arguments(files))
+    assert outcome.code == 0
+    assert f"note: {files['track2']}: the last line has no line end" in outcome.err
+
+
 def test_import_rts_needs_three_tracks(tsgt: Tsgt, files: dict[str, Path]) -> None:
     """The paper has three prisms."""
     others = ["--prisms", files["prisms"], "--output", files["recording"]]

@@ -268,6 +268,19 @@ async def test_folder_outside_the_sandbox_fails(tmp_path: Path) -> None:
     assert f"ReadWritePaths={tmp_path}/journals" in found.detail
 
 
+@pytest.mark.parametrize("permitted", ["", "/home"])
+async def test_folder_in_a_home_is_hidden_from_the_service(tmp_path: Path, permitted: str) -> None:
+    """ReadWritePaths does not help there, so it is not advised."""
+    fake = FakeMachine(tmp_path)
+    assert fake.service is not None
+    fake.service["ReadWritePaths"] = permitted
+    fake.change("client.toml", 'directory = "journals"', 'directory = "/home/pi/journal"')
+    found = (await fake.run_checks())["disk"]
+    assert found.ok is False
+    assert "hides /home/pi/journal: configure a folder outside" in found.detail
+    assert "ReadWritePaths" not in found.detail
+
+
 async def test_write_test_leaves_nothing(tmp_path: Path) -> None:
     """The test file is removed."""
     found = (await FakeMachine(tmp_path).run_checks())["disk_write"]

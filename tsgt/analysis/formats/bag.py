@@ -18,7 +18,7 @@ BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 
 def is_bag(path: Path) -> bool:
     """Whether a path names a bag: a folder, or a file with the suffix of one."""
-    return path.is_dir() or path.suffix in BAG_SUFFIXES
+    return path.is_dir() or path.suffix.lower() in BAG_SUFFIXES
 
 
 @contextmanager

@@ -23,6 +23,10 @@ HORIZONTAL = tuple(f"horizontal_angle_{unit}" for unit in RAD_PER_UNIT)
 ZENITH = tuple(f"zenith_angle_{unit}" for unit in RAD_PER_UNIT)
 TIME = ("stamp_ns", "time_s")
 
+_FULL_CIRCLE_RAD = (
+    2 * math.pi + 1e-4
+)  # An instrument rounds the last angle before zero up to 400 gon, or 6.2832
+
 
 @dataclass(frozen=True, slots=True)
 class Header:
@@ -40,7 +44,12 @@ class Header:
                 expected = ", ".join("|".join(alternatives) for alternatives in columns)
                 if optional:
                     expected += f" and optionally {', '.join(optional)}"
-                raise self.error(f"unknown column {quoted(name)}; expected {expected}")
+                hint = ""
+                if len(self.names) == 1 and any(separator in name for separator in ";\t"):
+                    hint = "; columns are separated by commas"
+                elif name[:1].isdigit():
+                    hint = "; the first line that is no comment (#) must have the names of the columns"
+                raise self.error(f"unknown column {quoted(name)}{hint}; expected {expected}")
         for alternatives in (*columns, *([name] for name in optional)):
             found = [name for name in self.names if name in alternatives]
             if len(found) > 1 or (not found and alternatives[0] not in optional):
@@ -131,11 +140,11 @@ class Row:
         zenith = zenith or next(name for name in ZENITH if name in self.cells)
         horizontal_rad = self.number(horizontal) * RAD_PER_UNIT.get(horizontal.rpartition("_")[2], 1.0)
         zenith_rad = self.number(zenith) * RAD_PER_UNIT.get(zenith.rpartition("_")[2], 1.0)
-        if abs(horizontal_rad) > 2 * math.pi:
+        if abs(horizontal_rad) > _FULL_CIRCLE_RAD:
             raise self.error(
                 f"{horizontal} {self.cells[horizontal]} is more than a full circle; is the unit right?"
             )
-        if not 0 <= zenith_rad <= 2 * math.pi:
+        if not 0 <= zenith_rad <= _FULL_CIRCLE_RAD:
             raise self.error(
                 f"{zenith} {self.cells[zenith]} is outside 0 to a full circle; it is measured from the zenith, "
                 "not from the horizon"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from tsgt.analysis.formats.bag import open_bag
+from tsgt.analysis.formats.bag import is_bag, open_bag
 from tsgt.analysis.formats.csv_table import TIME, read_table
-from tsgt.analysis.formats.sample_runs import MIN_SAMPLES, SampleRun, sample_runs
+from tsgt.analysis.formats.sample_runs import SampleRun, in_order_of_time, sample_runs
 from tsgt.errors import InputFileError
 from tsgt.model import ImuSamples
 
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tsgt.model import Vector3
-
-TABLE_SUFFIX = ".csv"
 
 _RATE = tuple(f"angular_rate_{axis}_radps" for axis in "xyz")
 _FORCE = tuple(f"specific_force_{axis}_mps2" for axis in "xyz")
@@ -33,22 +31,12 @@ class FileSample(NamedTuple):
 
 
 def read_imu_files(paths: Sequence[Path], topic: str | None = None) -> list[FileSample]:
-    """Read CSV files and bags in the order of time; of samples of the same time the last is kept.
+    """Read CSV files and bags, in the order of time.
 
     ``topic``: of a bag; default: the only one with IMU messages. Raises InputFileError if a file cannot be used, and
     MissingExtraError for a bag without the library rosbags.
     """
-    unique: dict[int, FileSample] = {}
-    for path in paths:
-        samples = {each.stamp_ns: each for each in _read(path, topic)}
-        if len(samples) < MIN_SAMPLES:
-            raise InputFileError("contains fewer than two samples of an IMU", path=path)
-        unique |= samples
-    return [unique[stamp_ns] for stamp_ns in sorted(unique)]
-
-
-def _read(path: Path, topic: str | None) -> Iterable[FileSample]:
-    return _table(path) if path.suffix == TABLE_SUFFIX else _bag(path, topic)
+    return in_order_of_time((path, _bag(path, topic) if is_bag(path) else _table(path)) for path in paths)
 
 
 def imu_records(
@@ -105,8 +93,18 @@ def _bag(path: Path, topic: str | None) -> Iterable[FileSample]:
 def _sample(message: object, path: Path) -> FileSample:
     stamp = message.header.stamp  # type: ignore[attr-defined]
     rate, force = message.angular_velocity, message.linear_acceleration  # type: ignore[attr-defined]
+    # A message says in this way that it does not contain them (sensor_msgs/Imu).
+    for covariance in (message.angular_velocity_covariance, message.linear_acceleration_covariance):  # type: ignore[attr-defined]
+        if covariance[0] == -1:
+            raise InputFileError(
+                "has messages without angular velocity or linear acceleration (their covariance begins with -1)",
+                path=path,
+            )
+    stamp_ns = int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    if stamp_ns < 0:
+        raise InputFileError(f"has a message with a time before 1970, {stamp_ns} ns", path=path)
     sample = FileSample(
-        int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec),
+        stamp_ns,
         (float(rate.x), float(rate.y), float(rate.z)),
         (float(force.x), float(force.y), float(force.z)),
     )

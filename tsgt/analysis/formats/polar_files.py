@@ -40,11 +40,12 @@ def read_polar_tracks(paths: Sequence[Path]) -> list[Measurement]:
             station = row.positive_integer("station") if "station" in row.cells else position
             found = _measurement(row, station, counts.get(station, 0))
             where = f"{path}, line {row.line}"
-            known = seen.setdefault((station, found.prism, found.stamp_ns), where)
-            if known != where and found.status.usable:
-                raise row.error(
-                    f"duplicate of {known}: station {station}, prism {found.prism}, same time; remove one of the lines"
-                )
+            if found.status.usable:
+                known = seen.setdefault((station, found.prism, found.stamp_ns), where)
+                if known != where:
+                    raise row.error(
+                        f"duplicate of {known}: station {station}, prism {found.prism}, same time; remove one of the lines"
+                    )
             counts[station] = counts.get(station, 0) + 1
             measurements.append(found)
     return sorted(measurements, key=lambda m: m.received_ns)

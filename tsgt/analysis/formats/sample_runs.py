@@ -6,8 +6,11 @@ from itertools import pairwise
 from statistics import median
 from typing import TYPE_CHECKING, Generic, NamedTuple, Protocol, TypeVar
 
+from tsgt.errors import InputFileError
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
 
 GAP = 1.5  # median intervals; a longer one lacks samples
 
@@ -35,6 +38,28 @@ class SampleRun(NamedTuple, Generic[Sample]):
     """Sequence number of the first; it counts missing samples."""
     samples: list[Sample]
     duration_ns: tuple[int, ...]
+
+
+def in_order_of_time(files: Iterable[tuple[Path, Iterable[Sample]]]) -> list[Sample]:
+    """Return the samples of all files in the order of time, each once where files overlap.
+
+    Raises InputFileError if a file has fewer than two samples, or two different samples have the same time: one of them
+    would stand for the interval of both.
+    """
+    unique: dict[int, Sample] = {}
+    for path, samples in files:
+        times = set()
+        for sample in samples:
+            times.add(sample.stamp_ns)
+            if unique.setdefault(sample.stamp_ns, sample) != sample:
+                raise InputFileError(
+                    f"different samples have the same time, {sample.stamp_ns / 1e9:.9f} s ({sample.stamp_ns} ns); each needs its "
+                    "own, of the device's clock, with all its digits",
+                    path=path,
+                )
+        if len(times) < MIN_SAMPLES:
+            raise InputFileError("contains fewer than two samples", path=path)
+    return [unique[stamp_ns] for stamp_ns in sorted(unique)]
 
 
 def interval_ns(samples: Sequence[Stamped]) -> int:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsgt.analysis.formats.csv_table import TIME, read_table
-from tsgt.analysis.formats.sample_runs import MIN_SAMPLES, SampleRun, sample_runs
-from tsgt.errors import InputFileError
+from tsgt.analysis.formats.sample_runs import SampleRun, in_order_of_time, sample_runs
 from tsgt.model import OdometrySamples
 
 if TYPE_CHECKING:
@@ -25,14 +24,8 @@ class WheelSample(NamedTuple):
 
 
 def read_wheel_files(paths: Sequence[Path]) -> list[WheelSample]:
-    """Read CSV files, in the order of time; of samples of the same time the last is kept.
-
-    Raises InputFileError if a file cannot be used, or they have fewer than two samples.
-    """
-    unique = {sample.stamp_ns: sample for path in paths for sample in _table(path)}
-    if len(unique) < MIN_SAMPLES:
-        raise InputFileError("contains fewer than two samples of odometry", path=paths[0])
-    return [unique[stamp_ns] for stamp_ns in sorted(unique)]
+    """Read CSV files, in the order of time; raises InputFileError if one cannot be used."""
+    return in_order_of_time((path, _table(path)) for path in paths)
 
 
 def wheel_records(samples: Sequence[WheelSample], offset_ns: int) -> Iterator[OdometrySamples]:

@@ -164,6 +164,8 @@ def export(
     if records == "measurements":
         # Those before another set-up, and without any, are as recorded, too.
         raw = load_recording(recording, whole=True, keep_going=keep_going, on_problem=report_problem)
+        if not raw.measurements:
+            raise RecordingError("has no measurements", path=recording)
         lines = measurement_csv(raw.measurements)
     else:
         poses = _poses_of(

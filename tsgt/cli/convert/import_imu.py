@@ -66,16 +66,20 @@ def import_imu(
 
     FILES are CSV files, or ROS 2 bags (a folder, or an MCAP file) with sensor_msgs/Imu. The columns of a CSV file are
     stamp_ns or time_s (Unix time), angular_rate_x_radps, _y_, _z_, and specific_force_x_mps2, _y_, _z_, gravity
-    included. Times must be those of the device, not of the arrival: durations are their differences.
+    included. Times must be those of the device, not of the arrival: durations are their differences, and no two samples
+    have the same time.
     """
     from tsgt.analysis.formats import imu_records, interval_ns, read_imu_files
-    from tsgt.analysis.formats.imu_files import TABLE_SUFFIX
+    from tsgt.analysis.formats.bag import is_bag
 
     if recording is not None and context.get_parameter_source("offset_ms") is not ParameterSource.DEFAULT:
         raise click.UsageError("--align finds the offset; omit --offset-ms")
     refuse_overwrite([*files, recording], output)
+    tables = [path for path in files if not is_bag(path)]
+    if topic is not None and len(tables) == len(files):
+        raise click.UsageError("--topic is of a bag, and no file is one")
     samples = read_imu_files(files, topic)
-    note_cut_tables(path for path in files if path.suffix == TABLE_SUFFIX)
+    note_cut_tables(tables)
     offset_ns = round(offset_ms * 1e6)
     clock = None if recording is None else _aligned(recording, samples)
     to_master_ns = (lambda stamp_ns: stamp_ns + offset_ns) if clock is None else clock.to_master_ns

@@ -115,7 +115,12 @@ def import_rts(
         )
     sources = [*tracks, prisms, *([targets] if targets else [])]
     refuse_overwrite(sources, output)
+    if targets is None:
+        for option, given in ((TARGET_CONSTANT, target_constant_mm), (PRISM_CONSTANT, prism_constant_mm)):
+            if given is not None:
+                raise click.UsageError(f"{option} is for raw measurements, which need --targets")
     published = read_tracks((tracks[0], tracks[1], tracks[2]))
+    note_cut_tables(tracks)
     layout = read_prisms(prisms)
     if targets is None:
         stations = tuple(StationParameters(station=k, prism=k) for k in (1, 2, 3))
@@ -170,6 +175,8 @@ def import_polar(
     """
     if (frames is None) == (targets is None):
         raise click.UsageError("the station frames are unknown: give --frames or --targets")
+    if targets is None and target_constant_mm is not None:
+        raise click.UsageError(f"{TARGET_CONSTANT} belongs to --targets")
     sources = [*tracks, prisms, *(path for path in (frames, targets) if path is not None)]
     refuse_overwrite(sources, output)
     measurements = read_polar_tracks(tracks)

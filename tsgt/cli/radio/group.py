@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
@@ -48,7 +49,7 @@ def key_command(file: Path) -> None:
     click.echo(f"""{file}: a new key for all radios of one mission. Anybody who has it can take part: keep it secret.
 
 On each machine of the mission, for the daemon's user:
-  sudo install -o tsgt -g tsgt -m 600 {file.name} /etc/tsgt/radio.key
+  sudo install -o tsgt -g tsgt -m 600 {shlex.quote(file.name)} /etc/tsgt/radio.key
 In the configuration of each daemon, under [protocol]:
   kind = "superframe"
   key_file = "radio.key"

@@ -35,9 +35,11 @@ from tsgt.radio.planning import (
     MIN_POWER_DBM,
     REGIONS,
     Channel,
+    ChannelUse,
     duty_cycle_limit,
     power_limit_dbm,
     preset_power_dbm,
+    violations,
 )
 from tsgt.radio.sx127x import RadioStatistics, SX127x, Wiring, open_hal
 
@@ -149,15 +151,17 @@ def ping_command(
     frequency_hz = round(frequency_mhz * 1e6)
     if region is not None:
         channel = Channel(frequency_hz, modem.bandwidth_hz)
-        power_dbm = _legal_power_dbm(region, channel, power_dbm, antenna_gain_dbi)
         # A reply is as long as its request, whose length the side that responds does not know.
         longest_bytes = MAX_PAYLOAD_BYTES if answering else payload_bytes
-        _check_duty_cycle(
-            region,
-            channel,
-            count=count if answering else count or DEFAULT_COUNT,
-            airtime_ms=airtime_us(longest_bytes, **dataclasses.asdict(modem)) / 1000,
-        )
+        airtime_ms = airtime_us(longest_bytes, **dataclasses.asdict(modem)) / 1000
+        packets = count if answering else count or DEFAULT_COUNT
+        if power_dbm is None:
+            power_dbm = preset_power_dbm(region, **channel._asdict(), antenna_gain_dbi=antenna_gain_dbi)
+        duty = 1.0 if packets is None else packets * airtime_ms / _HOUR_MS
+        settings = LoRaSettings(frequency_hz=frequency_hz, **dataclasses.asdict(modem), power_dbm=power_dbm)
+        if violations(ChannelUse(settings, antenna_gain_dbi, duty, duty), region):
+            _refuse_power(region, channel, power_dbm, antenna_gain_dbi)
+            _refuse_duty_cycle(region, channel, packets=packets, airtime_ms=airtime_ms)
     settings = LoRaSettings(
         frequency_hz=frequency_hz,
         **dataclasses.asdict(modem),
@@ -232,33 +236,32 @@ def _print_summary(summary: Summary, statistics: RadioStatistics) -> None:
     click.echo(f"turnaround   {_times_text(summary.turnaround_ns)}, RxDone to start of the reply, there")
 
 
-def _legal_power_dbm(region: str, channel: Channel, power_dbm: int | None, antenna_gain_dbi: float) -> int:
-    """Return the power; raises RadioSettingsError if the region does not allow it."""
-    if power_dbm is None:
-        power_dbm = preset_power_dbm(region, **channel._asdict(), antenna_gain_dbi=antenna_gain_dbi)
+def _refuse_power(region: str, channel: Channel, power_dbm: int, antenna_gain_dbi: float) -> None:
+    """Raise RadioSettingsError for a power that the region does not allow for this use."""
     limit_dbm = power_limit_dbm(region, **channel._asdict(), antenna_gain_dbi=antenna_gain_dbi)
     excess_db = power_dbm - limit_dbm
     if excess_db <= _ROUNDING_DB:
-        return power_dbm
+        return
     legal = CHANNELS[region]
     remedy = f"a legal channel: --frequency-mhz {legal.frequency_hz / 1e6:g} --bandwidth-khz {legal.bandwidth_hz / 1e3:g}"
     if channel == legal:
         gain_dbi = math.floor(10 * (antenna_gain_dbi - excess_db) + _ROUNDING_DB) / 10
         remedy = f"with an attenuator of {math.ceil(10 * excess_db - _ROUNDING_DB) / 10:.1f} dB: --antenna-gain-dbi {gain_dbi:g}"
+    always = "" if duty_cycle_limit(region, **channel._asdict()) else " at any duty cycle"
     raise RadioSettingsError(
-        f"{region} allows {limit_dbm:.1f} dBm into an antenna of {antenna_gain_dbi:g} dBi at "
+        f"{region} allows{always} {limit_dbm:.1f} dBm into an antenna of {antenna_gain_dbi:g} dBi at "
         f"{channel.frequency_hz / 1e6:g} MHz and {channel.bandwidth_hz / 1e3:g} kHz, and {power_dbm} dBm would be "
         f"transmitted; {remedy}"
     )
 
 
-def _check_duty_cycle(region: str, channel: Channel, *, count: int | None, airtime_ms: float) -> None:
-    """Raise RadioSettingsError if ``count`` packets (None: without end) take longer than the region allows in an hour."""
+def _refuse_duty_cycle(region: str, channel: Channel, *, packets: int | None, airtime_ms: float) -> None:
+    """Raise RadioSettingsError if so many packets (None: without end) take longer than the region allows in an hour."""
     duty_cycle = duty_cycle_limit(region, **channel._asdict())
     if duty_cycle is None:
         return
     most = int(duty_cycle * _HOUR_MS / airtime_ms)
-    if count is None or count > most:
+    if packets is None or packets > most:
         legal = CHANNELS[region]
         raise RadioSettingsError(
             f"{region} allows a radio to transmit for {100 * duty_cycle:g} % of any hour at {channel.frequency_hz / 1e6:g} MHz, "

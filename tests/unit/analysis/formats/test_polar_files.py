@@ -106,6 +106,22 @@ def test_file_per_station(tmp_path: Path) -> None:
     assert tracked_prisms(found) == {1: 7, 2: 8}
 
 
+@pytest.mark.parametrize("angle", ["400.0000", "-400.0000"])
+def test_rounded_full_circle_is_an_angle(tmp_path: Path, angle: str) -> None:
+    """An instrument rounds the last angle before zero up."""
+    header = "stamp_ns,horizontal_angle_gon,zenith_angle_gon,slope_distance_m"
+    (found,) = read_polar_tracks([written(tmp_path, header, f"{START_NS},{angle},100,10")])
+    assert isinstance(found, PolarMeasurement)
+    assert abs(found.horizontal_angle_rad) == pytest.approx(2 * math.pi)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_line_without_a_target_is_no_duplicate(tmp_path: Path, order: int) -> None:
+    """Whichever of both comes first."""
+    lines = [GOOD, GOOD.replace("ok", "no_target")]
+    assert len(read_polar_tracks([written(tmp_path, HEADER, *lines[::order])])) == 2
+
+
 HEADER = "stamp_ns,station,horizontal_angle_rad,zenith_angle_rad,slope_distance_m,status"
 GOOD = f"{START_NS},1,1.0,1.5,20.0,ok"
 

@@ -34,7 +34,11 @@ def write_table(path: Path) -> Path:
 
 
 def write_bag(
-    path: Path, *topics: str, plugin: StoragePlugin = StoragePlugin.MCAP, force_z: float = 9.81
+    path: Path,
+    *topics: str,
+    plugin: StoragePlugin = StoragePlugin.MCAP,
+    force_z: float = 9.81,
+    absent: bool = False,
 ) -> Path:
     """Write the same samples as messages."""
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -57,7 +61,7 @@ def write_bag(
                     angular_velocity=types["geometry_msgs/msg/Vector3"](x=n / 1000, y=0.0, z=0.1),
                     angular_velocity_covariance=covariance,
                     linear_acceleration=types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=force_z),
-                    linear_acceleration_covariance=covariance,
+                    linear_acceleration_covariance=covariance - np.eye(9)[0] if absent else covariance,
                 )
                 data = store.serialize_cdr(message, "sensor_msgs/msg/Imu")
                 writer.write(connection, stamp_ns + 7_000_000, data)
@@ -122,6 +126,24 @@ def test_absurd_sample_of_a_bag_is_one_line(tmp_path: Path, force_z: float) -> N
     assert not (tmp_path / "imu.jsonl").exists()
 
 
+def test_messages_without_acceleration_are_refused(tmp_path: Path) -> None:
+    """A covariance that begins with -1 says that the zeros beside it mean nothing."""
+    bag = write_bag(tmp_path / "bag", "/imu", force_z=0.0, absent=True)
+    outcome = called("import", "imu", bag, "--output", tmp_path / "imu.jsonl")
+    assert outcome.code == 1
+    assert "without angular velocity or linear acceleration" in outcome.err
+
+
+def test_files_that_overlap_give_each_sample_once(tmp_path: Path) -> None:
+    """A logger may repeat its last lines in the next file."""
+    whole = write_table(tmp_path / "whole.CSV").read_text().splitlines()
+    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    first.write_text("\n".join(whole[:60]) + "\n")
+    second.write_text("\n".join([whole[0], *whole[50:]]) + "\n")
+    assert imported(tmp_path, tmp_path / "whole.CSV").exists()
+    assert imported(tmp_path, second, first).exists()
+
+
 def test_topic_is_chosen(tmp_path: Path) -> None:
     """Where there are several."""
     bag = write_bag(tmp_path / "bag", "/a", "/b")
@@ -137,6 +159,12 @@ def test_topic_is_chosen(tmp_path: Path) -> None:
         ("stamp_ns\n1\n", "expected one column angular_rate_x_radps"),
         (COLUMNS + "\n1,0,0,5000,0,0,9.8\n", "expected -100 to 100"),
         (COLUMNS + "\n1,0,0,0,0,0,9.8\n", "fewer than two samples"),
+        (
+            COLUMNS + "\n1,0,0,0,0,0,9.8\n2,0,0,0,0,0,9.8\n2,0,0,1,0,0,9.8\n",
+            "different samples have the same time",
+        ),
+        (COLUMNS.replace(",", ";") + "\n1;0;0;0;0;0;9.8\n", "columns are separated by commas"),
+        ("# " + COLUMNS + "\n1,0,0,0,0,0,9.8\n2,0,0,0,0,0,9.8\n", "must have the names of the columns"),
     ],
 )
 def test_bad_table_is_one_line(tmp_path: Path, text: str, expected: str) -> None:
@@ -161,7 +189,7 @@ def test_file_that_is_no_bag_is_one_line(tmp_path: Path) -> None:
 def test_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the extra that has it."""
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    outcome = called("import", "imu", tmp_path / "bag", "--output", tmp_path / "imu.jsonl")
+    outcome = called("import", "imu", tmp_path / "bag.mcap", "--output", tmp_path / "imu.jsonl")
     assert outcome.code == 1
     assert "pip install 'tsgt[mcap]'" in outcome.err
 

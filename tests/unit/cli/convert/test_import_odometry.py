@@ -60,6 +60,15 @@ def test_table_without_speed_is_rejected(tmp_path: Path) -> None:
     assert "speed_mps" in result.err
 
 
+def test_two_speeds_of_one_time_are_rejected(tmp_path: Path) -> None:
+    """As of a driver that stamps a batch, or with too few digits: one of them would stand for both."""
+    table = tmp_path / "wheels.csv"
+    table.write_text("time_s,speed_mps\n1.0,0.1\n1.1,0.2\n1.1,0.3\n")
+    result = called("import", "odometry", table, "--output", tmp_path / "odometry.jsonl")
+    assert result.code == 1
+    assert "different samples have the same time, 1.100000000 s" in result.err
+
+
 def test_empty_table_is_not_called_cut(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It has no last line; the reader says what is wrong with it."""
     (path := tmp_path / "empty.csv").touch()

@@ -111,7 +111,10 @@ class VectorNav:
                 return 0
             if crc_hqx(data[1:_FRAME_BYTES], 0) != 0:
                 return 1
-            samples.append(_sample(data[_HEADER.size :]))
+            sample = _sample(data[_HEADER.size :])
+            # A line has several samples, and one that is no number would cost all of them.
+            if all(map(math.isfinite, (*sample.delta_angle_rad, *sample.delta_velocity_mps))):
+                samples.append(sample)
             return _FRAME_BYTES
         if data[:1] == b"$":
             end = data.find(b"\n", 0, _MAX_TEXT_BYTES)

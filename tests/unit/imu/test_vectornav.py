@@ -41,6 +41,17 @@ def test_samples_are_decoded() -> None:
     assert sample.delta_velocity_mps == pytest.approx((0.0, 0.01, 0.049))
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_sample_that_is_no_number_is_left_out(value: float) -> None:
+    """The others of its line are kept; the gap shows in their times."""
+    frames = [
+        frame(n * 5_000_000, 0.005, (value if n == 2 else 0.1, 0.0, 0.0), (0.0, 0.0, 0.049))
+        for n in (1, 2, 3)
+    ]
+    samples, _ = VectorNav(200).push(b"".join(frames))
+    assert [sample.instrument_time_ns for sample in samples] == [5_000_000, 15_000_000]
+
+
 STREAM = b"".join(
     [
         b"garbage\xfa\x01",

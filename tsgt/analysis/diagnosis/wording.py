@@ -89,20 +89,20 @@ WORDING: dict[SetupCause, Wording] = {
         "drive the same path in both directions",
     ),
     SetupCause.VERTICAL_INDEX: Wording(
-        "Station {n} has a vertical index error of {size}",
+        "Station {n} has a vertical index error of {size} that its calibration does not contain",
         "vertical index of station {n}",
         "mrad",
         1e3,
-        "Set `vertical_index_mrad` of that station in the file of station frames to this value, or measure the targets in both "
+        "Add this to `vertical_index_mrad` of that station in the file of station frames (0 if it has none), or measure the targets in both "
         "faces (`tsgt calibrate collect --repeats 2`), from which the frames are solved with it. Adjust the instrument before the next drive.",
         "measure one target in both faces with that station",
     ),
     SetupCause.COLLIMATION: Wording(
-        "Station {n} has a collimation error of {size}",
+        "Station {n} has a collimation error of {size} that its calibration does not contain",
         "collimation of station {n}",
         "mrad",
         1e3,
-        "Set `collimation_mrad` of that station in the file of station frames to this value. Adjust the instrument.",
+        "Add this to `collimation_mrad` of that station in the file of station frames (0 if it has none). Adjust the instrument.",
         "measure one target in both faces with that station",
     ),
     SetupCause.RANGE_CONSTANT: Wording(

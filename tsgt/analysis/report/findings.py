@@ -98,7 +98,7 @@ class Findings:
     ----------
     start_ns, end_ns : First and last measurement.
     log : Radio, clocks, events.
-    inter_prism, distance_errors : Inter-prism distances; None if a prism was not measured.
+    inter_prism, distance_errors : Distances between the measured prisms; None if fewer than two were measured.
     odometry_stationary_ns : Stationary intervals of the odometry, within the recording or not; None without odometry.
     difference : Between the estimators.
     held_out : Prediction errors, if requested.
@@ -276,10 +276,12 @@ def collect_findings(
 
 def distances_problem(tracks: Mapping[int, Track]) -> dict[str, str]:
     """Return why there are no inter-prism distances, as an entry of ``Findings.problems``; empty if there may be."""
+    if len(tracks) == 1:
+        return {"inter_prism": "the robot has a single prism"}
     unmeasured = [f"prism {prism}" for prism, track in tracks.items() if not len(track)]
-    if unmeasured:
-        return {"inter_prism": f"no usable measurement of {' and '.join(unmeasured)}"}
-    return {"inter_prism": "the robot has a single prism"} if len(tracks) == 1 else {}
+    if len(tracks) - len(unmeasured) > 1:
+        return {}
+    return {"inter_prism": f"no usable measurement of {' and '.join(unmeasured)}"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -176,6 +176,13 @@ def _distances(f: Findings) -> Iterator[Verdict]:
         level = Level.CARE if single else Level.BAD
         yield Verdict(level, f"No inter-prism distances: {f.problems['inter_prism']}.")
         return
+    measured = {prism for pair in f.inter_prism.dynamic for prism in pair.prisms}
+    missing = [str(each.prism) for each in f.recording.parameters.prisms if each.prism not in measured]
+    if missing:
+        yield Verdict(
+            Level.CARE,
+            f"Prism {' and prism '.join(missing)} has no usable measurement; distances are those between the others.",
+        )
     static = [pair.statistics() for pair in f.inter_prism.static if len(pair.distances_m)]
     moving = [pair.statistics() for pair in f.inter_prism.dynamic if len(pair.distances_m)]
     if not moving:
@@ -212,13 +219,15 @@ def _reference(f: Findings) -> Iterator[Verdict]:
     at = point_label(f.recording.parameters.reference_point)
     poses = f.poses
     shown = None if poses is None else Kind(poses.kind[0]).estimator
+    any_compared = any(each.compared for each in f.reference_errors.values())
     for name, each in f.reference_errors.items():
         if not each.compared:
-            yield Verdict(
-                Level.BAD,
-                f"No valid pose of {name} is within the time of the reference; nothing was compared.",
-                "Check that the reference is of this drive and on the same clock.",
-            )
+            if name == shown or not any_compared:  # the other one has no poses of fewer than three prisms
+                yield Verdict(
+                    Level.BAD,
+                    f"No valid pose of {name} is within the time of the reference; nothing was compared.",
+                    "Check that the reference is of this drive and on the same clock.",
+                )
             continue
         consistent = math.isfinite(each.nees.mean) and _NEES[0] <= each.nees.mean <= _NEES[1]
         if consistent and name != shown:

@@ -302,15 +302,16 @@ def _print_evaluation(found: _Evaluation, reference_path: Path | None, align: Al
     errors = {name: each.unaligned for name, each in found.comparisons.items()}
     print_verdicts(assess(found.recording, found.path, continuous, distances, errors, found.diagnosis))
     click.echo(f"\n{pose_summary(found.poses)} over {duration_s(found.poses):.1f} s")
-    valid = distances.epochs - distances.invalid_epochs
-    click.echo(
-        f"\nDistances between prisms at 20 Hz, interpolated: {valid} of {distances.epochs} epochs valid (mm)"
-    )
-    _print_pairs(distances.dynamic)
-    click.echo(
-        f"\nDistances between prisms while stationary, raw pairs within {distances.stationary_s:.1f} s (mm)"
-    )
-    _print_pairs(distances.static)
+    if distances.dynamic:  # else a single prism was measured
+        valid = distances.epochs - distances.invalid_epochs
+        click.echo(
+            f"\nDistances between prisms at 20 Hz, interpolated: {valid} of {distances.epochs} epochs valid (mm)"
+        )
+        _print_pairs(distances.dynamic)
+        click.echo(
+            f"\nDistances between prisms while stationary, raw pairs within {distances.stationary_s:.1f} s (mm)"
+        )
+        _print_pairs(distances.static)
     if found.held_out is not None:
         click.echo("\nHeld-out prediction error (mm)")
         _print_held_out(found.held_out)

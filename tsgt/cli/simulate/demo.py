@@ -135,11 +135,16 @@ def demo(
         click.echo(f"orientation  {errors.orientation_rms_deg:.2f} deg rms error")
     for series, live in result.live.items():
         keys = live.keys()
-        age = "newest measurement" if series == "predicted" else "sent"
-        click.echo(
-            f"{series:<12} {keys['valid_fraction']:.0%} valid, {age} {keys['age_ms']['p50']:.0f} ms old (median), rms errors "
-            f"{live.errors.position_rms_mm:.1f} mm at {at} and {live.errors.orientation_rms_deg:.2f} deg"
-        )
+        text = f"{series:<12} " + (f"{keys['valid_fraction']:.0%} valid" if live.poses else "no poses")
+        if live.valid_poses:
+            age = "newest measurement" if series == "predicted" else "sent"
+            text += f", {age} {keys['age_ms']['p50']:.0f} ms old (median)"
+        if not math.isnan(live.errors.position_rms_mm):
+            text += (
+                f", rms errors {live.errors.position_rms_mm:.1f} mm at {at} and "
+                f"{live.errors.orientation_rms_deg:.2f} deg"
+            )
+        click.echo(text)
     click.echo(f"files        {folder}: configuration, logs, journals")
     if result.recording is not None:
         click.echo(f"recording    {result.recording}")

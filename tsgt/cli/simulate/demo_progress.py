@@ -98,7 +98,7 @@ class Progress:
     @property
     def best(self) -> str:
         """The series of poses to report: the best that the estimator makes."""
-        return "smoothed" if self.poses["predicted"] else "interpolated"
+        return next((series for series in ("smoothed", "predicted") if self.poses[series]), "interpolated")
 
     def live_poses(self, series: str) -> LivePoses:
         """Return the poses of a series so far, with the errors of the valid ones, without 2 s at both ends."""

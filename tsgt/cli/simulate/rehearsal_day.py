@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tsgt.simulation.rehearsal import Site
 
 STEP_TIMEOUT_S = 180.0
-"""Of a step that a script plays; people have all the time that they need."""
+"""Of a step that a script plays, besides the drive; people have all the time that they need."""
 
 HIDDEN, EMPTY, MOVED = 3, 1, MOVED_TRIPOD.station
 """Stations whose prism is hidden, whose battery ends, and whose tripod is moved."""
@@ -287,13 +287,14 @@ class Day:
                 await asyncio.sleep(_POLL_S)
 
         waiting = asyncio.create_task(until_done())
+        limit_s = STEP_TIMEOUT_S + self.drive_s
         try:
             if self.operator is not None:
                 await waiting
                 if look:
                     await self.operator.ask("Enter goes on")
             else:
-                async with asyncio.timeout(STEP_TIMEOUT_S):
+                async with asyncio.timeout(limit_s):
                     if look_first:
                         await waiting
                     if script is not None:
@@ -301,7 +302,7 @@ class Day:
                     await waiting
         except TimeoutError:
             raise TsgtError(
-                f"step {self.step} ({title}) has not ended within {STEP_TIMEOUT_S:g} s; see the logs in {self.folder}"
+                f"step {self.step} ({title}) has not ended within {limit_s:g} s; see the logs in {self.folder}"
             ) from None
         finally:
             waiting.cancel()

@@ -55,7 +55,8 @@ def rehearse(*, auto: bool, incidents: Sequence[str], drive_s: float, seed: int,
     battery ends, a tripod is moved. At the end it says what was noticed and when, and how accurate the poses were.
     Ctrl-C ends it early.
 
-    Exit code 3: something was not noticed, or the poses of a part with good frames were wrong.
+    Exit code 3: something was not noticed, the poses of a part with good frames were wrong, or it was ended before the
+    first drive.
     """
     folder = Path(tempfile.mkdtemp(prefix="tsgt-rehearsal-"))
     if len(str(folder.absolute() / "instrument1.sock")) > MAX_SOCKET_PATH_BYTES:
@@ -87,8 +88,10 @@ def rehearse(*, auto: bool, incidents: Sequence[str], drive_s: float, seed: int,
 def _debrief(day: Day, folder: Path, *, as_json: bool) -> int:
     """Print what was noticed and how accurate the poses were; return the exit code."""
     good = {name: part for name, part in day.parts.items() if not name.startswith("tripod moved")}
-    ok = all(each.noticed_s is not None for each in day.incidents) and all(
-        part.poses and part.position_rms_mm < LIMIT_MM for part in good.values()
+    ok = (
+        bool(good)  # else it was ended before the first drive
+        and all(each.noticed_s is not None for each in day.incidents)
+        and all(part.poses and part.position_rms_mm < LIMIT_MM for part in good.values())
     )
     if as_json:
         print_json(

@@ -29,10 +29,10 @@ _HELPER = """\
 # Tells the helper at a tripod what to do: aim STATION TARGET, clear STATION, or battery STATION.
 cd "$(dirname "$0")" || exit 1
 [ -p orders ] || { echo "the rehearsal is not running" >&2; exit 1; }
-case "$1" in
-    aim) [ $# = 3 ] && echo "aim $2 $3" > orders && echo "the helper aims station $2 at target $3" ;;
-    clear) [ $# = 2 ] && echo "clear $2" > orders && echo "the helper clears the line of sight of station $2" ;;
-    battery) [ $# = 2 ] && echo "battery $2" > orders && echo "the helper changes the battery of station $2" ;;
+case "$1 $#" in
+    "aim 3") echo "aim $2 $3" > orders && echo "the helper aims station $2 at target $3" ;;
+    "clear 2") echo "clear $2" > orders && echo "the helper clears the line of sight of station $2" ;;
+    "battery 2") echo "battery $2" > orders && echo "the helper changes the battery of station $2" ;;
     *) echo "usage: ./helper aim STATION TARGET | clear STATION | battery STATION" >&2; exit 2 ;;
 esac
 """

@@ -205,12 +205,15 @@ def later(samples: OdometrySamples, shift_ns: int) -> OdometrySamples:
 @pytest.mark.slow
 @pytest.mark.parametrize("stations", [1, 2])
 def test_one_and_two_stations_are_evaluated(tsgt: Tsgt, tmp_path: Path, stations: int) -> None:
-    """Text and report, without distances between three prisms."""
-    path = tmp_path / "field.jsonl"
+    """Text and report, without distances between three prisms; linear has no poses, and is not held against them."""
+    path, truth = tmp_path / "field.jsonl", tmp_path / "truth.tum"
     write(path, imu_recording(shaken_drive(22.0), stations=stations))
-    text = tsgt("evaluate", path, "--no-held-out")
+    assert tsgt("process", path, "--output", truth).code == 0
+    text = tsgt("evaluate", path, "--no-held-out", "--reference", truth)
     assert text.code == 0, text.err
     assert "IMU: used with station" in text.out
+    assert ("Distances between prisms" in text.out) is (stations == 2)
+    assert "No valid pose of linear" not in text.out
     done = tsgt("evaluate", path, "--no-held-out", "--report", tmp_path / "report")
     assert done.code == 0, done.err
     assert "IMU of the robot" in (tmp_path / "report" / "report.html").read_text()

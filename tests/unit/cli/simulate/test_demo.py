@@ -48,6 +48,19 @@ def timeline() -> UnixTimeline:
 
 
 @pytest.mark.usefixtures("capsys")
+def test_best_series_is_one_that_has_poses(demo: Demo, timeline: UnixTimeline) -> None:
+    """A short demonstration ends before the first smoothed pose."""
+    progress = Progress(demo, timeline)
+    assert progress.best == "interpolated"
+    line = next(_lines(_estimated(demo), timeline.unix_ns(demo.start_ns)))
+    assert b'"kind":"smoothed"' in line
+    progress.line(line.replace(b'"kind":"smoothed"', b'"kind":"predicted"'))
+    assert progress.best == "predicted"
+    progress.line(line)
+    assert progress.best == "smoothed"
+
+
+@pytest.mark.usefixtures("capsys")
 def test_progress_keeps_few_bytes_per_pose(demo: Demo, timeline: UnixTimeline) -> None:
     """A day has 3.5 million poses; the errors of all are known without storing the poses."""
     start_ns = timeline.unix_ns(demo.start_ns)

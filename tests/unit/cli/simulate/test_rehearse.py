@@ -75,7 +75,7 @@ async def _step(_day: Day, *_text: str, watch: Callable[[], None] = lambda: None
 
 @pytest.mark.usefixtures("short_temporary_folder")
 def test_rehearsal_that_ends_before_the_first_recording(tsgt: Tsgt, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C at once: the debriefing has nothing to tell."""
+    """Ctrl-C at once: the debriefing has nothing to tell, and nothing is shown to be right."""
 
     async def ended(_day: Day, _incidents: object) -> None:
         """Nothing was done."""
@@ -84,7 +84,7 @@ def test_rehearsal_that_ends_before_the_first_recording(tsgt: Tsgt, monkeypatch:
     monkeypatch.setattr("tsgt.cli.simulate.rehearse.Watch", lambda *_arguments: _Watch([]))
     monkeypatch.setattr(Day, "play", ended)
     result = tsgt("rehearse", "--auto")
-    assert result.code == 0, result.err
+    assert result.code == 3, result.err
     assert result.out.endswith(", without a recording\n")
 
 

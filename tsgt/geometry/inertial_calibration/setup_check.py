@@ -60,10 +60,12 @@ Cause = Literal[
 GROSS: frozenset[Cause] = frozenset({"unit_of_rate", "unit_of_force", "gravity_sign", "axes", "unrelated"})
 """Causes that rates and forces themselves show."""
 
+MIN_TILT_RAD = math.radians(0.15)
+"""Of a rotation about horizontal axes: gyro and gravity take seven tenths of it into the attitude, whatever the prisms say."""
 MIN_ROTATION_RAD = math.radians(0.5)
 MIN_POSITION_M = 0.05
 MIN_LATENCY_S = 0.004
-"""Errors below these harm little: a few tenths of a millimetre, a few hundredths of a degree."""
+"""Errors below these harm less, as the prisms tell heading and position: by up to 2 mm and 0.06 degrees."""
 
 MIN_SIGNIFICANCE = 5.0  # Sigmas, of three components together
 EXCLUDED_SIGMAS = 2.0
@@ -314,8 +316,14 @@ def _estimated_errors(
         error, covariance = error - gain @ unseen @ error, covariance - gain @ unseen @ covariance
     # The axes that are configured are the gyro's: the accelerometer's may be turned against them in the case.
     identity = np.eye(len(error))
+    rotation = gyro_rotation(solution.point.setup)
+    up = mounting.rotation.T @ _up(states)
+    tilt = (np.eye(3) - np.outer(up, up)) @ rotation
+    # One or two prisms tell a tilt with errors of the accelerometer's axes in it: up to 0.2 degrees of a consumer IMU.
+    tilt_limit_rad = MIN_ROTATION_RAD if len(axes) else MIN_TILT_RAD
     parts: tuple[tuple[Cause, FloatArray, float], ...] = (
-        ("rotation", gyro_rotation(solution.point.setup), MIN_ROTATION_RAD),
+        ("rotation", rotation, MIN_ROTATION_RAD),
+        ("rotation", tilt, tilt_limit_rad),
         ("position", identity[POSITION], MIN_POSITION_M),
         ("latency", identity[LATENCY : LATENCY + 1], MIN_LATENCY_S),
     )
@@ -324,8 +332,11 @@ def _estimated_errors(
         return certain_bound(jacobian @ error, jacobian @ covariance @ jacobian.T)
 
     findings: list[SetupFinding] = []
-    excluded: set[Cause] = {cause for cause, jacobian, limit in parts if bound(jacobian) < limit}
+    excluded: set[Cause] = {cause for cause, _, _ in parts}
+    excluded -= {cause for cause, jacobian, limit in parts if bound(jacobian) >= limit}
     for cause, jacobian, limit in parts:
+        if cause in (each.cause for each in findings):
+            continue
         part, own = jacobian @ error, jacobian @ covariance @ jacobian.T
         size = float(np.linalg.norm(part))
         if (
@@ -338,12 +349,19 @@ def _estimated_errors(
         excluded.discard(cause)
     bounds = (
         # The accelerometer tells the rotation about the vertical sooner than the gyro.
-        min(bound(gyro_rotation(solution.point.setup)), bound(identity[ROTATION])) / MIN_ROTATION_RAD,
+        min(bound(rotation), bound(identity[ROTATION])) / MIN_ROTATION_RAD,
+        bound(tilt) / tilt_limit_rad,
         bound(identity[POSITION][:2]) / MIN_POSITION_M,
         bound(identity[LATENCY : LATENCY + 1]) / MIN_LATENCY_S,
     )
     confirmed = not findings and max(bounds) < CONFIRMED_LIMITS
     return SetupCheck(tuple(findings), frozenset(excluded), confirmed)
+
+
+def _up(states: States) -> FloatArray:
+    """Return the mean direction of up in the axes of the robot, (3,)."""
+    up = states.rotation[:, 2, :].mean(axis=0)
+    return np.asarray(up / np.linalg.norm(up))
 
 
 def certain_bound(error: FloatArray, covariance: FloatArray) -> float:

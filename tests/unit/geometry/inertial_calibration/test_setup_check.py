@@ -111,6 +111,21 @@ def test_mounting_one_degree_off(axis: int) -> None:
     assert "the mounting of the IMU is wrong by" in finding.text
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("grade", ["industrial", "consumer"])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_tilt_of_three_tenths_of_a_degree(axis: int, grade: str) -> None:
+    """About a horizontal axis of the robot it tilts the poses by most of it, and is named with its size."""
+    right = drive(grade)
+    turn = exp_so3(0.3 * DEG * np.eye(3)[axis])
+    check = replace(right, mounting=replace(right.mounting, rotation=turn @ right.mounting.rotation)).check()
+    assert "rotation" not in check.excluded
+    finding = only(check)
+    assert finding.cause == "rotation"
+    assert finding.size == pytest.approx(0.3 * DEG, abs=4 * finding.sigma)
+    assert not check.confirmed
+
+
 @pytest.mark.parametrize("axis", EACH_AXIS)
 @pytest.mark.slow
 def test_lever_arm_100_mm_off(axis: int) -> None:

@@ -89,13 +89,13 @@ def check_limits(config: ClientConfig | MasterConfig, path: Path) -> Finding:
     found, radio = legality(config, path), config.radio
     settings, use = found.use.settings, found.use
     if isinstance(config, MasterConfig):
-        duty = f"{100 * use.master_duty:.0f} %, of each of the {found.stations} stations up to {100 * use.station_duty:.0f} %"
+        duty = f"{100 * use.master_duty:.0f} % (master), {100 * use.station_duty:.0f} % (each of {found.stations} stations)"
     else:
         duty = f"at least {100 * use.station_duty:.0f} %"
     text = (
         f"{settings.frequency_hz / 1e6:g} MHz, SF {settings.spreading_factor}, {settings.bandwidth_hz / 1e3:g} kHz, "
         f"{settings.power_dbm} dBm into {radio.antenna_gain_dbi:g} dBi ({use.eirp_dbm:.1f} dBm e.i.r.p., "
-        f"{use.erp_dbm:.1f} e.r.p.), duty cycle at {RATE_HZ:g} Hz {duty}"
+        f"{use.erp_dbm:.1f} e.r.p.), duty cycle at {RATE_HZ:g} Hz: {duty}"
     )
     if found.violations:
         return failed(

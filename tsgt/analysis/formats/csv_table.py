@@ -23,9 +23,8 @@ HORIZONTAL = tuple(f"horizontal_angle_{unit}" for unit in RAD_PER_UNIT)
 ZENITH = tuple(f"zenith_angle_{unit}" for unit in RAD_PER_UNIT)
 TIME = ("stamp_ns", "time_s")
 
-_FULL_CIRCLE_RAD = (
-    2 * math.pi + 1e-4
-)  # An instrument rounds the last angle before zero up to 400 gon, or 6.2832
+_FULL_CIRCLE_RAD = 2 * math.pi + 1e-4
+"""An instrument rounds the last angles before zero up, to 400 gon or 6.2832."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,7 +53,7 @@ def in_order_of_time(files: Iterable[tuple[Path, Iterable[Sample]]]) -> list[Sam
             times.add(sample.stamp_ns)
             if unique.setdefault(sample.stamp_ns, sample) != sample:
                 raise InputFileError(
-                    f"different samples have the same time, {sample.stamp_ns / 1e9:.9f} s ({sample.stamp_ns} ns); each needs its "
+                    f"different samples have the same time, {sample.stamp_ns // 10**9}.{sample.stamp_ns % 10**9:09d} s; each needs its "
                     "own, of the device's clock, with all its digits",
                     path=path,
                 )

@@ -148,26 +148,28 @@ def ping_command(
         if not simulated:
             raise click.UsageError("give --frequency-mhz, a carrier frequency that is legal where you are")
         frequency_mhz = SIMULATED_FREQUENCY_MHZ
-    frequency_hz = round(frequency_mhz * 1e6)
+    channel = Channel(round(frequency_mhz * 1e6), modem.bandwidth_hz)
+    if power_dbm is None:
+        power_dbm = (
+            MIN_POWER_DBM
+            if region is None
+            else preset_power_dbm(region, **channel._asdict(), antenna_gain_dbi=antenna_gain_dbi)
+        )
+    settings = LoRaSettings(
+        frequency_hz=channel.frequency_hz,
+        **dataclasses.asdict(modem),
+        sync_word=sync_word,
+        power_dbm=power_dbm,
+    )
     if region is not None:
-        channel = Channel(frequency_hz, modem.bandwidth_hz)
         # A reply is as long as its request, whose length the side that responds does not know.
         longest_bytes = MAX_PAYLOAD_BYTES if answering else payload_bytes
         airtime_ms = airtime_us(longest_bytes, **dataclasses.asdict(modem)) / 1000
         packets = count if answering else count or DEFAULT_COUNT
-        if power_dbm is None:
-            power_dbm = preset_power_dbm(region, **channel._asdict(), antenna_gain_dbi=antenna_gain_dbi)
         duty = 1.0 if packets is None else packets * airtime_ms / _HOUR_MS
-        settings = LoRaSettings(frequency_hz=frequency_hz, **dataclasses.asdict(modem), power_dbm=power_dbm)
         if violations(ChannelUse(settings, antenna_gain_dbi, duty, duty), region):
             _refuse_power(region, channel, power_dbm, antenna_gain_dbi)
             _refuse_duty_cycle(region, channel, packets=packets, airtime_ms=airtime_ms)
-    settings = LoRaSettings(
-        frequency_hz=frequency_hz,
-        **dataclasses.asdict(modem),
-        sync_word=sync_word,
-        power_dbm=MIN_POWER_DBM if power_dbm is None else power_dbm,
-    )
     if answering:
         _answer(settings, wiring, count=count, as_json=as_json)
         return 0

@@ -61,11 +61,11 @@ GROSS: frozenset[Cause] = frozenset({"unit_of_rate", "unit_of_force", "gravity_s
 """Causes that rates and forces themselves show."""
 
 MIN_TILT_RAD = math.radians(0.15)
-"""Of a rotation about horizontal axes: gyro and gravity take seven tenths of it into the attitude, whatever the prisms say."""
+"""Of a rotation about horizontal axes: gyro and gravity take most of it into the attitude, whatever the prisms say."""
 MIN_ROTATION_RAD = math.radians(0.5)
 MIN_POSITION_M = 0.05
 MIN_LATENCY_S = 0.004
-"""Errors below these harm less, as the prisms tell heading and position: by up to 2 mm and 0.06 degrees."""
+"""Errors below these harm less, as the prisms tell heading and position."""
 
 MIN_SIGNIFICANCE = 5.0  # Sigmas, of three components together
 EXCLUDED_SIGMAS = 2.0
@@ -319,11 +319,11 @@ def _estimated_errors(
     rotation = gyro_rotation(solution.point.setup)
     up = mounting.rotation.T @ _up(states)
     tilt = (np.eye(3) - np.outer(up, up)) @ rotation
-    # One or two prisms tell a tilt with errors of the accelerometer's axes in it: up to 0.2 degrees of a consumer IMU.
-    tilt_limit_rad = MIN_ROTATION_RAD if len(axes) else MIN_TILT_RAD
+    # What one or two prisms tell of a tilt has errors of a consumer accelerometer's axes in it.
+    tilts = () if len(axes) else (tilt,)
     parts: tuple[tuple[Cause, FloatArray, float], ...] = (
         ("rotation", rotation, MIN_ROTATION_RAD),
-        ("rotation", tilt, tilt_limit_rad),
+        *(("rotation", tilt, MIN_TILT_RAD) for tilt in tilts),
         ("position", identity[POSITION], MIN_POSITION_M),
         ("latency", identity[LATENCY : LATENCY + 1], MIN_LATENCY_S),
     )
@@ -350,7 +350,7 @@ def _estimated_errors(
     bounds = (
         # The accelerometer tells the rotation about the vertical sooner than the gyro.
         min(bound(rotation), bound(identity[ROTATION])) / MIN_ROTATION_RAD,
-        bound(tilt) / tilt_limit_rad,
+        *(bound(tilt) / MIN_TILT_RAD for tilt in tilts),
         bound(identity[POSITION][:2]) / MIN_POSITION_M,
         bound(identity[LATENCY : LATENCY + 1]) / MIN_LATENCY_S,
     )

@@ -49,7 +49,7 @@ class StuckValues:
 
 @dataclass(frozen=True, slots=True)
 class DeviceClockJump:
-    """The clock of the device jumps, positive: forwards, and stays so."""
+    """The clock of the device jumps, positive: forwards, and stays so; back to zero at most, where it begins."""
 
     at_s: float
     jump_s: float
@@ -106,8 +106,10 @@ def apply_conditions(
             case StuckValues():
                 samples = _stuck(samples, _during(samples, condition))
             case DeviceClockJump():
-                later_ns = np.where(samples.end_s >= condition.at_s, round(condition.jump_s * 1e9), 0)
-                samples = replace(samples, device_ns=samples.device_ns + later_ns)
+                later = samples.end_s >= condition.at_s
+                least_ns = -int(samples.device_ns[later].min(initial=np.iinfo(np.int64).max))
+                jump_ns = max(round(condition.jump_s * 1e9), least_ns)
+                samples = replace(samples, device_ns=samples.device_ns + np.where(later, jump_ns, 0))
             case LateBurst():
                 until_s = condition.at_s + condition.duration_s
                 samples = replace(samples, arrival_s=hold_back(samples.arrival_s, condition.at_s, until_s))

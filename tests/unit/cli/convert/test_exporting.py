@@ -212,6 +212,16 @@ def test_measurements_are_exported_as_recorded(tsgt: Tsgt, tmp_path: Path) -> No
         ]
 
 
+def test_recording_without_measurements_has_none_to_export(tsgt: Tsgt, tmp_path: Path) -> None:
+    """As one of poses alone: a file with a header only would look like a result."""
+    path, output = tmp_path / "poses.jsonl", tmp_path / "measurements.csv"
+    path.write_bytes(recording_bytes(pose(0, "smoothed", 0.0)))
+    outcome = tsgt("export", path, "--records", "measurements", "--output", output)
+    assert outcome.code == 1
+    assert "has no measurements" in outcome.err
+    assert not output.exists()
+
+
 def test_inputs_are_not_overwritten(tsgt: Tsgt, live: Path, tmp_path: Path) -> None:
     """Recording and reference."""
     reference = tmp_path / "reference.tum"

@@ -248,6 +248,15 @@ def test_report_of_one_station(tsgt: Tsgt, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_report_of_two_measured_prisms_has_their_distance(tmp_path: Path) -> None:
+    """A prism that was not measured does not hide the distance between the others."""
+    found = findings(recorded(tmp_path, keep="12"))
+    assert found.inter_prism is not None
+    assert [pair.name for pair in found.inter_prism.dynamic] == ["1-2"]
+    assert "Prism 3 has no usable measurement; distances are those between the others." in report_text(found)
+
+
+@pytest.mark.slow
 def test_report_without_stationary_interval(tmp_path: Path) -> None:
     """The figure of stationary distances says so."""
     found = findings(recorded(tmp_path, driving))

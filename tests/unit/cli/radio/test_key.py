@@ -51,3 +51,9 @@ def test_configured_key_must_exist(tmp_path: Path) -> None:
     """A daemon does not run without the configured key."""
     with pytest.raises(ConfigError, match="no such file"):
         radio_key(SuperframeConfig(kind="superframe", key_file=tmp_path / "mission.key"))
+
+
+def test_command_for_a_name_with_blanks_is_quoted(tsgt: Tsgt, tmp_path: Path) -> None:
+    """It is pasted into a shell."""
+    outcome = tsgt("radio", "key", tmp_path / "my key")
+    assert "-m 600 'my key' /etc/tsgt/radio.key" in outcome.out

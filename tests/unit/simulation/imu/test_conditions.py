@@ -95,6 +95,13 @@ def test_clock_jump_stays() -> None:
     np.testing.assert_array_equal(change_ns, np.where(samples.end_s >= 2.0, -500_000_000, 0))
 
 
+def test_clock_begins_at_zero() -> None:
+    """Jumps back, however many, lead to the start of the clock at most, as a restart of the device does."""
+    samples = _run(DeviceClockJump(2.0, -100.0), DeviceClockJump(4.0, -100.0)).samples
+    assert samples.device_ns[samples.end_s >= 4.0][0] == 0
+    assert samples.device_ns.min() == 0
+
+
 def test_late_burst_arrives_at_its_end() -> None:
     """What arrives in the interval arrives at its end, in order."""
     samples = _run(LateBurst(2.0, 0.7)).samples
